@@ -1,0 +1,18 @@
+//! Environments, the task sets made of them, and the loop that rolls episodes out. An environment knows no
+//! network, no decision order and no transport.
+//!
+//! - [`Environment`]: what one task's world does; [`conformance`] is the suite every one of them passes.
+//! - [`TaskSet`]: which tasks belong together; which are for training, which for testing.
+//! - [`Seated`]: an environment seen in decision order.
+//! - [`rollout`]: rolls numbered episodes with a [`rit_episode::Policy`], several at once.
+
+pub mod conformance;
+mod environment;
+pub mod matrix_game;
+pub mod rollout;
+mod seated;
+mod task_set;
+
+pub use environment::{Environment, Step};
+pub use seated::Seated;
+pub use task_set::{Split, Task, TaskSet, UnknownName};

@@ -1,0 +1,226 @@
+//! The rollout loop: numbered episodes in, finished episodes out. Actors and evaluation share it.
+
+use crate::{Seated, Task};
+use rand::RngExt as _;
+use rit_episode::{
+    Action, End, Episode, EpisodeBuilder, Observation, Policy, Rng, RunSeed, Stream, Turn, decision_order,
+};
+
+/// An episode to be rolled.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Job {
+    /// Its number: the index of all its random streams.
+    pub number: u64,
+    /// The weights the policy acts with, recorded in the episode.
+    pub weights_version: u64,
+    /// Probability of a random action, per agent.
+    pub epsilon: f32,
+    /// Index of the task; drawn uniformly from the episode's own stream where `None`.
+    pub task: Option<usize>,
+}
+
+/// Rolls episodes of a list of tasks, several at once. What an episode holds depends on the seed, its job
+/// and the policy alone, not on the jobs beside it.
+pub struct Rollout {
+    tasks: Vec<Task>,
+    seed: RunSeed,
+    random_permutation: bool,
+    /// Worlds that wait for their next episode, by task.
+    idle: Vec<Vec<Seated>>,
+}
+
+/// A running episode.
+struct Running {
+    slot: usize,
+    task: usize,
+    world: Seated,
+    epsilon: f32,
+    environment_rng: Rng,
+    exploration: Rng,
+    observation: Observation,
+    previous_reward: f32,
+    actions: Vec<Action>,
+    builder: EpisodeBuilder,
+}
+
+impl Rollout {
+    /// Rolls episodes of these tasks with streams of this seed; with `random_permutation` each episode's
+    /// decision order is a fresh uniform permutation.
+    ///
+    /// # Panics
+    /// Without tasks.
+    pub fn new(tasks: Vec<Task>, seed: RunSeed, random_permutation: bool) -> Self {
+        assert!(!tasks.is_empty(), "a rollout needs a task");
+        let idle = tasks.iter().map(|_| Vec::new()).collect();
+        Self {
+            tasks,
+            seed,
+            random_permutation,
+            idle,
+        }
+    }
+
+    /// Rolls all jobs side by side to their ends and returns their episodes in the jobs' order.
+    pub fn roll(&mut self, policy: &mut dyn Policy, jobs: &[Job]) -> Vec<Episode> {
+        let mut episodes: Vec<Option<Episode>> = jobs.iter().map(|_| None).collect();
+        let mut running: Vec<Running> = jobs
+            .iter()
+            .enumerate()
+            .map(|(slot, job)| self.begin(policy, slot, job))
+            .collect();
+        while !running.is_empty() {
+            let mut turns: Vec<Turn<'_>> = running.iter_mut().map(Running::turn).collect();
+            policy.act(&mut turns);
+            drop(turns);
+            running = running
+                .into_iter()
+                .filter_map(|mut running| {
+                    let Some((end, won)) = running.step() else {
+                        return Some(running);
+                    };
+                    self.idle[running.task].push(running.world);
+                    episodes[running.slot] = Some(running.builder.finish(end, won));
+                    None
+                })
+                .collect();
+        }
+        episodes.into_iter().flatten().collect()
+    }
+
+    fn begin(&mut self, policy: &mut dyn Policy, slot: usize, job: &Job) -> Running {
+        let stream = |name| self.seed.stream(name, job.number);
+        let task = job
+            .task
+            .unwrap_or_else(|| stream(Stream::Task).random_range(0..self.tasks.len()));
+        let mut world = self.idle[task]
+            .pop()
+            .unwrap_or_else(|| Seated::new(self.tasks[task].environment()));
+        let n_agents = world.environment().n_agents();
+        let order = if self.random_permutation {
+            decision_order::draw(n_agents, &mut stream(Stream::DecisionOrder))
+        } else {
+            decision_order::identity(n_agents)
+        };
+        let mut environment_rng = stream(Stream::Environment);
+        world.reset(order.clone(), &mut environment_rng);
+        let mut observation = Observation::default();
+        world.observe(&mut observation);
+        policy.begin(slot, n_agents);
+        Running {
+            slot,
+            task,
+            world,
+            epsilon: job.epsilon,
+            environment_rng,
+            exploration: stream(Stream::Exploration),
+            builder: EpisodeBuilder::new(job.number, job.weights_version, task, order, &observation),
+            observation,
+            previous_reward: 0.0,
+            actions: vec![0; n_agents],
+        }
+    }
+}
+
+impl Running {
+    fn turn(&mut self) -> Turn<'_> {
+        Turn {
+            slot: self.slot,
+            observation: &self.observation,
+            previous_reward: self.previous_reward,
+            epsilon: self.epsilon,
+            exploration: &mut self.exploration,
+            actions: &mut self.actions,
+        }
+    }
+
+    /// Plays the joint action; returns how the episode ended once it has.
+    fn step(&mut self) -> Option<(End, bool)> {
+        let step = self.world.step(&self.actions, &mut self.environment_rng);
+        self.world.observe(&mut self.observation);
+        self.builder.step(&self.actions, step.reward, &self.observation);
+        self.previous_reward = step.reward;
+        step.end.map(|end| (end, step.won))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Split, TaskSet};
+    use rit_episode::decision_order::is_permutation;
+
+    /// Plays a fixed action by row.
+    struct Fixed([Action; 2]);
+
+    impl Policy for Fixed {
+        fn begin(&mut self, _: usize, _: usize) {}
+
+        fn act(&mut self, turns: &mut [Turn<'_>]) {
+            for turn in turns {
+                turn.actions.copy_from_slice(&self.0);
+            }
+        }
+    }
+
+    fn rollout(seed: u64, random_permutation: bool) -> Rollout {
+        Rollout::new(
+            TaskSet::MatrixGame.tasks(Split::Training),
+            RunSeed(seed),
+            random_permutation,
+        )
+    }
+
+    fn jobs(numbers: std::ops::Range<u64>) -> Vec<Job> {
+        numbers
+            .map(|number| Job {
+                number,
+                weights_version: 0,
+                epsilon: 0.0,
+                task: None,
+            })
+            .collect()
+    }
+
+    #[test]
+    fn an_episode_is_the_same_whoever_rolls_beside_it() {
+        let all = rollout(3, true).roll(&mut Fixed([0, 2]), &jobs(0..20));
+        for (number, episode) in all.iter().enumerate() {
+            let number = number as u64;
+            let alone = rollout(3, true).roll(&mut Fixed([0, 2]), &jobs(number..number + 1));
+            assert_eq!(alone, std::slice::from_ref(episode));
+        }
+        let tasks: std::collections::HashSet<_> = all.iter().map(|episode| episode.task).collect();
+        assert_eq!(tasks.len(), 4, "20 uniform draws meet all four games");
+    }
+
+    #[test]
+    fn actions_are_mapped_back_through_the_decision_order() {
+        // Game 1 is won by (a¹, a³) of the environment's agents. Rows play (a¹, a³), so it is won exactly
+        // when agent 0 decides first; game 4 is won by (a¹, a¹), whoever is first.
+        let jobs: Vec<Job> = (0..40)
+            .map(|number| Job {
+                task: Some(0),
+                ..jobs(number..number + 1)[0]
+            })
+            .collect();
+        let episodes = rollout(5, true).roll(&mut Fixed([0, 2]), &jobs);
+        for episode in &episodes {
+            assert!(is_permutation(&episode.decision_order));
+            assert_eq!(episode.won, episode.decision_order == [0, 1]);
+            assert_eq!(episode.rewards[1], if episode.won { 100.0 } else { -12.0 });
+            // Row k shows the player one-hot of the agent that sits there, and its own last action.
+            for row in 0..2 {
+                let features = &episode.entities[(2 + row) * 6..][..6];
+                assert_eq!(features[usize::from(episode.decision_order[row])], 1.0);
+                assert_eq!(features[3..], [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]][row]);
+            }
+        }
+        assert!(episodes.iter().any(|episode| episode.won) && episodes.iter().any(|episode| !episode.won));
+        let unpermuted = rollout(5, false).roll(&mut Fixed([0, 2]), &jobs);
+        assert!(
+            unpermuted
+                .iter()
+                .all(|episode| episode.won && episode.end == End::Terminated)
+        );
+    }
+}

@@ -1,0 +1,32 @@
+//! Whoever chooses joint actions: the acting networks, or a script.
+
+use crate::{Action, Observation, Rng};
+
+/// One running episode's turn: what is seen, and where its joint action goes.
+#[derive(Debug)]
+pub struct Turn<'a> {
+    /// Which of the policy's running episodes this is.
+    pub slot: usize,
+    /// The state, agents in decision order.
+    pub observation: &'a Observation,
+    /// Team reward of the previous step; 0 at the first.
+    pub previous_reward: f32,
+    /// Probability of a random action, per agent.
+    pub epsilon: f32,
+    /// The episode's own stream for exploration.
+    pub exploration: &'a mut Rng,
+    /// The joint action to be written, in decision order, `[n_agents]`.
+    pub actions: &'a mut [Action],
+}
+
+/// Chooses joint actions for several running episodes at once.
+///
+/// What one episode gets must not depend on which others run beside it, or the same seed would end
+/// elsewhere with another number of actors.
+pub trait Policy {
+    /// A new episode begins in this slot: what was remembered of the last one is forgotten.
+    fn begin(&mut self, slot: usize, n_agents: usize);
+
+    /// Writes the joint action of every turn. Each slot appears at most once.
+    fn act(&mut self, turns: &mut [Turn<'_>]);
+}
