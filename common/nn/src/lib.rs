@@ -1,1 +1,26 @@
-//! x
+//! f32 networks on faer's matrix products. This crate knows no reinforcement learning.
+//!
+//! - Parameters, gradients and optimiser moments are one flat buffer each; [`layout`] declares names and
+//!   shapes once, and layers hold ranges into the buffer.
+//! - Each layer's forward stands directly above its backward. Backward *adds* to the gradients it is given
+//!   for parameters, and writes or adds to input gradients as its documentation says.
+//! - Matrices are row-major [`View`]s; [`matmul`] is the one place that speaks to faer.
+//! - Everything runs on the calling thread. Whoever wants threads splits the batch.
+
+pub mod activation;
+pub mod attention;
+pub mod gradcheck;
+pub mod gru;
+pub mod layout;
+pub mod linear;
+pub mod math;
+pub mod matmul;
+pub mod optimizer;
+mod view;
+
+pub use attention::Attention;
+pub use gru::Gru;
+pub use layout::{Layout, LayoutBuilder, Param};
+pub use linear::Linear;
+pub use optimizer::{Optimizer, OptimizerKind};
+pub use view::{View, ViewMut, fit};

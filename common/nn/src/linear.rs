@@ -1,0 +1,182 @@
+//! A linear layer, y = x Wᵀ + b.
+
+use crate::{LayoutBuilder, View, ViewMut, activation, math, matmul};
+use faer::Accum;
+use std::ops::Range;
+
+/// A linear layer, or several over the same input that lie side by side and are computed as one.
+#[derive(Clone, Debug)]
+pub struct Linear {
+    weight: Range<usize>,
+    bias: Range<usize>,
+    /// Features of a row of x.
+    pub inputs: usize,
+    /// Features of a row of y.
+    pub outputs: usize,
+}
+
+impl Linear {
+    /// Declares `{name}.weight` (outputs, inputs) and `{name}.bias` (outputs).
+    pub fn new(layout: &mut LayoutBuilder, name: &str, inputs: usize, outputs: usize) -> Self {
+        Self::side_by_side(layout, inputs, &[(name, outputs)])
+    }
+
+    /// Declares several layers over one input. Their weights lie together, then their biases, so that one
+    /// product computes them all; their outputs stand side by side in the order given.
+    pub fn side_by_side(layout: &mut LayoutBuilder, inputs: usize, layers: &[(&str, usize)]) -> Self {
+        let bound = 1.0 / (inputs as f32).sqrt();
+        let weights = layout.len();
+        for (name, outputs) in layers {
+            layout.add(format!("{name}.weight"), &[*outputs, inputs], bound);
+        }
+        let biases = layout.len();
+        for (name, outputs) in layers {
+            layout.add(format!("{name}.bias"), &[*outputs], bound);
+        }
+        let outputs = layers.iter().map(|(_, outputs)| outputs).sum();
+        Self {
+            weight: weights..biases,
+            bias: biases..layout.len(),
+            inputs,
+            outputs,
+        }
+    }
+
+    /// A layer whose parameters are declared already: `weight` (outputs, inputs), `bias` (outputs).
+    pub fn at(weight: Range<usize>, bias: Range<usize>, inputs: usize) -> Self {
+        let outputs = bias.len();
+        debug_assert_eq!(weight.len(), inputs * outputs);
+        Self {
+            weight,
+            bias,
+            inputs,
+            outputs,
+        }
+    }
+
+    /// The weight, (outputs, inputs).
+    pub fn weight<'a>(&self, params: &'a [f32]) -> View<'a> {
+        View::dense(&params[self.weight.clone()], self.inputs)
+    }
+
+    /// The weight or its gradient to be written, (outputs, inputs).
+    pub fn weight_mut<'a>(&self, params: &'a mut [f32]) -> ViewMut<'a> {
+        ViewMut::dense(&mut params[self.weight.clone()], self.inputs)
+    }
+
+    /// The bias, (outputs).
+    pub fn bias<'a>(&self, params: &'a [f32]) -> &'a [f32] {
+        &params[self.bias.clone()]
+    }
+
+    /// The bias or its gradient to be written, (outputs).
+    pub fn bias_mut<'a>(&self, params: &'a mut [f32]) -> &'a mut [f32] {
+        &mut params[self.bias.clone()]
+    }
+
+    /// y = x Wᵀ + b. `x` (rows, inputs), `y` (rows, outputs).
+    pub fn forward(&self, params: &[f32], x: View<'_>, mut y: ViewMut<'_>) {
+        fill_rows(y.reborrow(), self.bias(params));
+        matmul::x_wt(x, self.weight(params), y, Accum::Add);
+    }
+
+    /// y = ReLU(x Wᵀ + b). `x` (rows, inputs), `y` (rows, outputs).
+    pub fn forward_relu(&self, params: &[f32], x: View<'_>, mut y: ViewMut<'_>) {
+        self.forward(params, x, y.reborrow());
+        activation::relu(y);
+    }
+
+    /// Adds to the gradients of W and b; writes dx (rows, inputs) where asked for. `dy` (rows, outputs).
+    pub fn backward(
+        &self,
+        params: &[f32],
+        x: View<'_>,
+        dy: View<'_>,
+        dx: Option<ViewMut<'_>>,
+        grads: &mut [f32],
+    ) {
+        self.backward_params(x, dy, grads);
+        if let Some(dx) = dx {
+            matmul::dy_w(dy, self.weight(params), dx, Accum::Replace);
+        }
+    }
+
+    /// Adds to the gradients of W and b alone.
+    pub fn backward_params(&self, x: View<'_>, dy: View<'_>, grads: &mut [f32]) {
+        matmul::dyt_x(dy, x, self.weight_mut(grads));
+        add_column_sums(dy, self.bias_mut(grads));
+    }
+}
+
+/// Writes the same row everywhere.
+pub fn fill_rows(mut y: ViewMut<'_>, row: &[f32]) {
+    for at in 0..y.rows {
+        y.row(at).copy_from_slice(row);
+    }
+}
+
+/// sums += Σ rows of dy: the gradient of a bias.
+pub fn add_column_sums(dy: View<'_>, sums: &mut [f32]) {
+    math::vectorized(|| {
+        for row in 0..dy.rows {
+            math::add_scaled(sums, 1.0, dy.row(row));
+        }
+    });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gradcheck::{check, noise};
+
+    #[test]
+    fn side_by_side_layers_are_the_layers() {
+        let mut layout = LayoutBuilder::default();
+        let both = Linear::side_by_side(&mut layout, 3, &[("a", 2), ("b", 4)]);
+        let layout = layout.finish();
+        let names: Vec<_> = layout.params().iter().map(|param| param.name.as_str()).collect();
+        assert_eq!(names, ["a.weight", "b.weight", "a.bias", "b.bias"]);
+        let params = noise(1, layout.len());
+        let x = noise(2, 5 * 3);
+        let mut y = vec![0.0; 5 * 6];
+        both.forward(&params, View::dense(&x, 3), ViewMut::dense(&mut y, 6));
+        for (param, columns) in [(0, 0..2), (1, 2..6)] {
+            let weight = View::dense(&params[layout.params()[param].range.clone()], 3);
+            let bias = &params[layout.params()[param + 2].range.clone()];
+            for row in 0..5 {
+                for (out, column) in columns.clone().enumerate() {
+                    let expected =
+                        bias[out] + (0..3).map(|i| x[row * 3 + i] * weight.row(out)[i]).sum::<f32>();
+                    assert!((y[row * 6 + column] - expected).abs() < 1e-5);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn gradients_are_the_numeric_ones() {
+        let mut layout = LayoutBuilder::default();
+        let linear = Linear::new(&mut layout, "l", 3, 4);
+        let (params, x, to) = (noise(1, layout.len()), noise(2, 5 * 3), noise(3, 5 * 4));
+        let loss = |params: &[f32], x: &[f32]| {
+            let mut y = vec![0.0; 5 * 4];
+            linear.forward_relu(params, View::dense(x, 3), ViewMut::dense(&mut y, 4));
+            y.iter().zip(&to).map(|(y, to)| f64::from(y * to)).sum()
+        };
+        let mut y = vec![0.0; 5 * 4];
+        linear.forward_relu(&params, View::dense(&x, 3), ViewMut::dense(&mut y, 4));
+        let mut dy = to.clone();
+        activation::relu_backward(View::dense(&y, 4), ViewMut::dense(&mut dy, 4));
+        let (mut grads, mut dx) = (vec![0.0; params.len()], vec![0.0; x.len()]);
+        let dx_view = Some(ViewMut::dense(&mut dx, 3));
+        linear.backward(
+            &params,
+            View::dense(&x, 3),
+            View::dense(&dy, 4),
+            dx_view,
+            &mut grads,
+        );
+        check("params", &params, &grads, |params| loss(params, &x));
+        check("x", &x, &dx, |x| loss(&params, x));
+    }
+}

@@ -1,0 +1,217 @@
+//! Matrix products, the one place that speaks to faer. Layouts are stated here and nowhere else: everything
+//! is row-major, weights are (out, in) as PyTorch stores them.
+//!
+//! A product's row depends on that row's input alone, not on how many rows are multiplied beside it: the
+//! same state must get the same utilities whichever other environments an actor steps at the same time. faer
+//! gives this for two rows and more; see [`x_wt`] for one row, and the test below.
+
+use crate::{View, ViewMut};
+use faer::{Accum, Par, linalg::matmul::matmul, mat};
+
+/// `y = x wᵀ`, or `y += x wᵀ`: a layer's forward. `x` (rows, in), `w` (out, in), `y` (rows, out).
+pub fn x_wt(x: View<'_>, w: View<'_>, y: ViewMut<'_>, accum: Accum) {
+    debug_assert_eq!((x.cols, x.rows, y.cols), (w.cols, y.rows, w.rows));
+    if x.rows == 1 {
+        return single_row(x, w, y, accum);
+    }
+    matmul(write(y), accum, read(x), read(w).transpose(), 1.0_f32, Par::Seq);
+}
+
+/// `dx = dy w`, or `dx += dy w`: a layer's backward to its input. `dy` (rows, out), `dx` (rows, in).
+pub fn dy_w(dy: View<'_>, w: View<'_>, dx: ViewMut<'_>, accum: Accum) {
+    debug_assert_eq!((dy.cols, dy.rows, dx.cols), (w.rows, dx.rows, w.cols));
+    matmul(write(dx), accum, read(dy), read(w), 1.0_f32, Par::Seq);
+}
+
+/// `dw += dyᵀ x`: a layer's backward to its weight. `dy` (rows, out), `x` (rows, in), `dw` (out, in).
+pub fn dyt_x(dy: View<'_>, x: View<'_>, dw: ViewMut<'_>) {
+    debug_assert_eq!((dy.rows, dy.cols, x.cols), (x.rows, dw.rows, dw.cols));
+    matmul(
+        write(dw),
+        Accum::Add,
+        read(dy).transpose(),
+        read(x),
+        1.0_f32,
+        Par::Seq,
+    );
+}
+
+/// One row goes through faer's matrix–vector path, which sums in another order. A second row of zeros keeps
+/// it on the path that all other row counts take.
+fn single_row(x: View<'_>, w: View<'_>, mut y: ViewMut<'_>, accum: Accum) {
+    let mut two = vec![0.0; 2 * x.cols];
+    two[..x.cols].copy_from_slice(x.row(0));
+    let mut out = vec![0.0; 2 * y.cols];
+    if accum == Accum::Add {
+        out[..y.cols].copy_from_slice(y.row(0));
+    }
+    x_wt(
+        View::dense(&two, x.cols),
+        w,
+        ViewMut {
+            data: &mut out,
+            rows: 2,
+            cols: y.cols,
+            stride: y.cols,
+        },
+        accum,
+    );
+    let cols = y.cols;
+    y.row(0).copy_from_slice(&out[..cols]);
+}
+
+fn read(view: View<'_>) -> mat::MatRef<'_, f32> {
+    mat::MatRef::from_row_major_slice_with_stride(
+        extent(view.data, view.rows, view.cols, view.stride),
+        view.rows,
+        view.cols,
+        view.stride,
+    )
+}
+
+fn write(view: ViewMut<'_>) -> mat::MatMut<'_, f32> {
+    let ViewMut {
+        data,
+        rows,
+        cols,
+        stride,
+    } = view;
+    let len = extent(data, rows, cols, stride).len();
+    // faer 0.24's `from_row_major_slice_with_stride_mut` swaps the strides and writes out of bounds; a
+    // column-major matrix transposed is the same view.
+    mat::MatMut::from_column_major_slice_with_stride_mut(&mut data[..len], cols, rows, stride).transpose_mut()
+}
+
+/// The elements from a matrix's first to its last.
+fn extent(data: &[f32], rows: usize, cols: usize, stride: usize) -> &[f32] {
+    if rows == 0 || cols == 0 {
+        &[]
+    } else {
+        &data[..(rows - 1) * stride + cols]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gradcheck::noise;
+
+    #[test]
+    fn products_are_what_the_loops_say() {
+        let (rows, inputs, outputs) = (5, 3, 4);
+        let (x, w, dy) = (
+            noise(1, rows * inputs),
+            noise(2, outputs * inputs),
+            noise(3, rows * outputs),
+        );
+        let (mut y, mut dx, mut dw) = (
+            vec![9.0; rows * outputs],
+            vec![1.0; rows * inputs],
+            vec![1.0; outputs * inputs],
+        );
+        let view = |data, cols| View::dense(data, cols);
+        x_wt(
+            view(&x, inputs),
+            view(&w, inputs),
+            ViewMut::dense(&mut y, outputs),
+            Accum::Replace,
+        );
+        dy_w(
+            view(&dy, outputs),
+            view(&w, inputs),
+            ViewMut::dense(&mut dx, inputs),
+            Accum::Add,
+        );
+        dyt_x(
+            view(&dy, outputs),
+            view(&x, inputs),
+            ViewMut::dense(&mut dw, inputs),
+        );
+        let close = |a: f32, b: f32| assert!((a - b).abs() < 1e-5, "{a} {b}");
+        for row in 0..rows {
+            for out in 0..outputs {
+                close(
+                    y[row * outputs + out],
+                    (0..inputs)
+                        .map(|i| x[row * inputs + i] * w[out * inputs + i])
+                        .sum(),
+                );
+            }
+            for i in 0..inputs {
+                let sum: f32 = (0..outputs)
+                    .map(|out| dy[row * outputs + out] * w[out * inputs + i])
+                    .sum();
+                close(dx[row * inputs + i], 1.0 + sum);
+            }
+        }
+        for out in 0..outputs {
+            for i in 0..inputs {
+                let sum: f32 = (0..rows)
+                    .map(|row| dy[row * outputs + out] * x[row * inputs + i])
+                    .sum();
+                close(dw[out * inputs + i], 1.0 + sum);
+            }
+        }
+    }
+
+    #[test]
+    fn strided_views_leave_their_neighbours_alone() {
+        let (x, w) = (noise(1, 6 * 5), noise(2, 2 * 3));
+        let mut y = vec![7.0; 6 * 4];
+        let x_columns = View::dense(&x, 5).columns(1..4);
+        x_wt(
+            x_columns,
+            View::dense(&w, 3),
+            ViewMut::dense(&mut y, 4).columns(1..3),
+            Accum::Replace,
+        );
+        for row in 0..6 {
+            assert_eq!((y[row * 4], y[row * 4 + 3]), (7.0, 7.0));
+            let expected: f32 = (0..3).map(|i| x[row * 5 + 1 + i] * w[i]).sum();
+            assert!((y[row * 4 + 1] - expected).abs() < 1e-5);
+        }
+    }
+
+    /// The property that acting for several environments at once rests on.
+    #[test]
+    fn a_row_does_not_depend_on_the_rows_beside_it() {
+        for (inputs, outputs) in [
+            (12, 64),
+            (64, 64),
+            (64, 128),
+            (128, 192),
+            (64, 192),
+            (148, 64),
+            (64, 5),
+            (64, 20),
+            (9, 8),
+            (192, 192),
+        ] {
+            let (x, w, start) = (
+                noise(1, 300 * inputs),
+                noise(2, outputs * inputs),
+                noise(3, 300 * outputs),
+            );
+            for accum in [Accum::Replace, Accum::Add] {
+                let run = |first: usize, rows: usize| {
+                    let mut y = start[first * outputs..(first + rows) * outputs].to_vec();
+                    let x = View::dense(&x[first * inputs..(first + rows) * inputs], inputs);
+                    x_wt(x, View::dense(&w, inputs), ViewMut::dense(&mut y, outputs), accum);
+                    y
+                };
+                let all = run(0, 300);
+                for (first, rows) in
+                    (1..64)
+                        .map(|rows| (rows % 7, rows))
+                        .chain([(3, 97), (0, 128), (50, 250)])
+                {
+                    let part = run(first, rows);
+                    assert!(
+                        part == all[first * outputs..(first + rows) * outputs],
+                        "{inputs} {outputs} {rows}"
+                    );
+                }
+            }
+        }
+    }
+}

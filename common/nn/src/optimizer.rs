@@ -1,0 +1,167 @@
+//! RMSprop and Adam as PyTorch defines them, and clipping by the global norm.
+
+use crate::math;
+
+/// Which optimiser, with its own constants.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum OptimizerKind {
+    /// v = α v + (1 − α) g²; p −= lr g / (√v + ε).
+    RmsProp {
+        /// α: how much of the last mean square stays.
+        alpha: f32,
+        /// ε, outside the root.
+        eps: f32,
+    },
+    /// Adam with bias correction.
+    Adam {
+        /// β₁: how much of the last mean stays.
+        beta1: f32,
+        /// β₂: how much of the last mean square stays.
+        beta2: f32,
+        /// ε, outside the root.
+        eps: f32,
+    },
+}
+
+/// An optimiser with its moments, each one flat buffer like the parameters.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Optimizer {
+    /// Which.
+    pub kind: OptimizerKind,
+    /// Learning rate.
+    pub lr: f32,
+    /// Steps taken.
+    pub steps: u64,
+    /// Mean of gradients; empty for RMSprop.
+    pub mean: Vec<f32>,
+    /// Mean of squared gradients.
+    pub mean_square: Vec<f32>,
+}
+
+impl Optimizer {
+    /// An optimiser at its beginning for this many parameters.
+    pub fn new(kind: OptimizerKind, lr: f32, len: usize) -> Self {
+        let mean = match kind {
+            OptimizerKind::RmsProp { .. } => Vec::new(),
+            OptimizerKind::Adam { .. } => vec![0.0; len],
+        };
+        Self {
+            kind,
+            lr,
+            steps: 0,
+            mean,
+            mean_square: vec![0.0; len],
+        }
+    }
+
+    /// Takes one step along `scale · grads`.
+    pub fn step(&mut self, params: &mut [f32], grads: &[f32], scale: f32) {
+        self.steps += 1;
+        let lr = self.lr;
+        match self.kind {
+            OptimizerKind::RmsProp { alpha, eps } => math::vectorized(|| {
+                for ((p, g), v) in params.iter_mut().zip(grads).zip(&mut self.mean_square) {
+                    let g = g * scale;
+                    *v = alpha * *v + (1.0 - alpha) * g * g;
+                    *p -= lr * g / (v.sqrt() + eps);
+                }
+            }),
+            OptimizerKind::Adam { beta1, beta2, eps } => {
+                // The corrections are taken in f64, as PyTorch takes them.
+                let correction = |beta: f32| 1.0 - f64::from(beta).powf(self.steps as f64);
+                let rate = (f64::from(lr) / correction(beta1)) as f32;
+                let root = correction(beta2).sqrt() as f32;
+                let moments = self.mean.iter_mut().zip(&mut self.mean_square);
+                math::vectorized(|| {
+                    for ((p, g), (m, v)) in params.iter_mut().zip(grads).zip(moments) {
+                        let g = g * scale;
+                        *m = beta1 * *m + (1.0 - beta1) * g;
+                        *v = beta2 * *v + (1.0 - beta2) * g * g;
+                        *p -= rate * *m / (v.sqrt() / root + eps);
+                    }
+                });
+            }
+        }
+    }
+}
+
+/// The Euclidean norm of all gradients, summed in f64.
+pub fn norm(grads: &[f32]) -> f64 {
+    // Lanes of a fixed number keep the sum the same on every instruction set.
+    let (chunks, rest) = grads.as_chunks::<8>();
+    let mut sums = [0.0_f64; 8];
+    math::vectorized(|| {
+        for chunk in chunks {
+            for (sum, &g) in sums.iter_mut().zip(chunk) {
+                *sum += f64::from(g) * f64::from(g);
+            }
+        }
+    });
+    let rest: f64 = rest.iter().map(|&g| f64::from(g) * f64::from(g)).sum();
+    (sums.iter().sum::<f64>() + rest).sqrt()
+}
+
+/// What to scale gradients with so that their norm is at most `limit`: PyTorch's min(1, limit / (‖g‖ + 1e-6)).
+pub fn clip_scale(norm: f64, limit: f64) -> f32 {
+    (limit / (norm + 1e-6)).min(1.0) as f32
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn close(a: f32, b: f64) {
+        assert!((f64::from(a) - b).abs() < 1e-6 * b.abs().max(1.0), "{a} {b}");
+    }
+
+    /// Two steps by hand, g = 0.5 then −1, p from 1.
+    #[test]
+    fn rmsprop_by_hand() {
+        let kind = OptimizerKind::RmsProp {
+            alpha: 0.9,
+            eps: 0.01,
+        };
+        let (mut optimizer, mut p) = (Optimizer::new(kind, 0.1, 1), [1.0]);
+        optimizer.step(&mut p, &[0.5], 1.0);
+        // v = 0.025; p = 1 − 0.1 · 0.5 / (0.158114 + 0.01)
+        close(p[0], 1.0 - 0.05 / (0.025_f64.sqrt() + 0.01));
+        let before = f64::from(p[0]);
+        optimizer.step(&mut p, &[-2.0], 0.5);
+        // v = 0.0225 + 0.1 = 0.1225, root 0.35
+        close(p[0], before + 0.1 / 0.36);
+    }
+
+    #[test]
+    fn adam_by_hand() {
+        let kind = OptimizerKind::Adam {
+            beta1: 0.9,
+            beta2: 0.99,
+            eps: 1e-8,
+        };
+        let (mut optimizer, mut p) = (Optimizer::new(kind, 0.1, 1), [1.0]);
+        optimizer.step(&mut p, &[0.5], 1.0);
+        // Both corrections undo the first step's shares: p = 1 − 0.1 · 0.5 / 0.5.
+        close(p[0], 0.9);
+        optimizer.step(&mut p, &[-1.0], 1.0);
+        let (m, v): (f64, f64) = (0.9 * 0.05 - 0.1, 0.99 * 0.0025 + 0.01);
+        close(p[0], 0.9 - 0.1 * (m / 0.19) / (v / 0.0199).sqrt());
+    }
+
+    #[test]
+    fn clipping_leaves_small_gradients_alone() {
+        let grads: Vec<f32> = (0..19)
+            .map(|i| {
+                if i == 7 {
+                    3.0
+                } else if i == 18 {
+                    4.0
+                } else {
+                    0.0
+                }
+            })
+            .collect();
+        assert_eq!(norm(&grads), 5.0);
+        assert_eq!(clip_scale(5.0, 10.0), 1.0);
+        close(clip_scale(20.0, 10.0), 10.0 / 20.000_001);
+    }
+}
