@@ -1,0 +1,161 @@
+//! The networks choosing joint actions, one row after another, for several running episodes at once.
+
+use crate::{
+    Before, Networks, Rit, Rows,
+    decoder::{Seen, Tables, best},
+};
+use rand::RngExt as _;
+use rit_episode::{Policy, Turn};
+use rit_nn::{View, math};
+use std::sync::Arc;
+
+/// A policy of the networks, ε-greedy. Holds only what acting needs: utility network and task encoder.
+pub struct Acting {
+    rit: Arc<Rit>,
+    params: Vec<f32>,
+    tables: Tables,
+    /// The recurrent states of each slot's running episode.
+    memories: Vec<Memory>,
+    rows: Rows,
+    networks: Networks,
+    before: Memory,
+}
+
+/// Recurrent states after the last step, agents in decision order.
+#[derive(Clone, Debug, Default)]
+struct Memory {
+    /// τ, `[n, h]`.
+    utility: Vec<f32>,
+    /// The task encoder's, `[n, h]`.
+    task_encoder: Vec<f32>,
+}
+
+impl Acting {
+    /// Acts with the given acting parameters (see [`Rit::acting`]).
+    pub fn new(rit: Arc<Rit>, params: &[f32]) -> Self {
+        let mut acting = Self {
+            rit,
+            params: Vec::new(),
+            tables: Tables::default(),
+            memories: Vec::new(),
+            rows: Rows::default(),
+            networks: Networks::default(),
+            before: Memory::default(),
+        };
+        acting.set_params(params);
+        acting
+    }
+
+    /// Takes other weights. Between episodes only: a running one would go on with histories of the old.
+    ///
+    /// # Panics
+    /// When there are not as many as acting needs.
+    pub fn set_params(&mut self, params: &[f32]) {
+        assert_eq!(
+            params.len(),
+            self.rit.acting().len(),
+            "the parameters that acting needs"
+        );
+        self.params.clear();
+        self.params.extend_from_slice(params);
+        self.tables = self.rit.utility.decoder.tables(&self.params);
+    }
+
+    /// The utilities of the last [`Policy::act`], turn after turn, `[agent rows, A]`: each row's Q given the
+    /// actions that were chosen before it.
+    pub fn utilities(&self) -> &[f32] {
+        &self.networks.utility.decoder.utilities
+    }
+
+    /// The task representations of the last [`Policy::act`], turn after turn, `[agent rows, h_z]`.
+    pub fn task_representations(&self) -> &[f32] {
+        &self.networks.task_encoder.representation
+    }
+}
+
+impl Policy for Acting {
+    fn begin(&mut self, slot: usize, n_agents: usize) {
+        if self.memories.len() <= slot {
+            self.memories.resize_with(slot + 1, Memory::default);
+        }
+        let len = n_agents * self.rit.config.hidden_dim;
+        let Memory {
+            utility,
+            task_encoder,
+        } = &mut self.memories[slot];
+        for state in [utility, task_encoder] {
+            state.clear();
+            state.resize(len, 0.0);
+        }
+    }
+
+    fn act(&mut self, turns: &mut [Turn<'_>]) {
+        let (h, n_actions) = (self.rit.config.hidden_dim, self.rit.config.n_actions);
+        let Self {
+            rit,
+            params,
+            tables,
+            memories,
+            rows,
+            networks,
+            before,
+        } = self;
+        rows.fill_from_turns(turns);
+        before.utility.clear();
+        before.task_encoder.clear();
+        for turn in turns.iter() {
+            before.utility.extend_from_slice(&memories[turn.slot].utility);
+            before
+                .task_encoder
+                .extend_from_slice(&memories[turn.slot].task_encoder);
+        }
+        let before = Before {
+            utility: Some(View::dense(&before.utility, h)),
+            task_encoder: Some(View::dense(&before.task_encoder, h)),
+        };
+        rit.prepare(params, tables, rows, before, networks);
+        for (group, turn) in rows.groups.iter().zip(turns.iter()) {
+            let states = group.queries.start * h..group.queries.end * h;
+            let memory = &mut memories[turn.slot];
+            memory
+                .utility
+                .copy_from_slice(&networks.utility.history()[states.clone()]);
+            if rit.task_encoder.is_some() {
+                memory
+                    .task_encoder
+                    .copy_from_slice(&networks.task_encoder.history()[states]);
+            }
+        }
+
+        let mut seen = Seen::start(n_actions);
+        let decoder = &mut networks.utility.decoder;
+        math::vectorized(|| {
+            for (group, turn) in rows.groups.iter().zip(turns.iter_mut()) {
+                seen.restart();
+                for (row, action) in group.queries.clone().zip(turn.actions.iter_mut()) {
+                    let available = &rows.available[row * n_actions..][..n_actions];
+                    let utilities = rit.utility.decoder.decide(params, tables, row, &seen, decoder);
+                    // Drawn whatever ε is, so that the stream stays in step.
+                    let explores = turn.exploration.random::<f32>() < turn.epsilon;
+                    *action = if explores {
+                        any(available, turn.exploration)
+                    } else {
+                        best(utilities, available)
+                    };
+                    seen.push(*action);
+                }
+            }
+        });
+    }
+}
+
+/// A uniformly random available action; 0 where none is.
+fn any(available: &[u8], rng: &mut rit_episode::Rng) -> u8 {
+    let count = available.iter().filter(|&&flag| flag != 0).count();
+    if count == 0 {
+        return 0;
+    }
+    let choice = rng.random_range(0..count);
+    let mut allowed = available.iter().enumerate().filter(|(_, flag)| **flag != 0);
+    allowed.nth(choice).map_or(0, |(action, _)| action as u8)
+}

@@ -1,0 +1,303 @@
+//! The rows of a batch that exist, in the order the networks work on them.
+//!
+//! Padding never reaches the networks. Episodes of a batch are ordered longest first and laid out time-major:
+//! all rows of time 0, then of time 1, …, where time T of an episode is its bootstrap state. So the rows of a
+//! time are a prefix of those of the time before, and one product serves all times where nothing is recurrent.
+
+use rit_episode::{Episode, Turn};
+use rit_nn::{View, attention::Group};
+
+/// One (episode, time) of a batch: a group of agents that decide together.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Step {
+    /// Index of the episode in the batch.
+    pub episode: usize,
+    /// Decision step, 0 to T; T is the bootstrap state, where nothing is decided.
+    pub time: usize,
+    /// Team reward; 0 in the bootstrap state.
+    pub reward: f32,
+    /// Whether the step was taken: false in the bootstrap state.
+    pub filled: bool,
+    /// Whether it was the last of an episode that terminated: its target does not bootstrap.
+    pub terminated: bool,
+    /// Index of the episode's task.
+    pub task: usize,
+}
+
+/// The packed rows of a batch, or of several running episodes at one step.
+///
+/// *Groups* are (time, episode) pairs; *agent rows* are the groups' agents in decision order, one group after
+/// another; *entity rows* are the groups' entities, agents first.
+#[derive(Debug, Default)]
+pub struct Rows {
+    /// Each group's agent rows (queries) and entity rows (keys).
+    pub groups: Vec<Group>,
+    /// What happened in each group.
+    pub steps: Vec<Step>,
+    /// First agent row of each time, then the number of agent rows.
+    pub agent_times: Vec<usize>,
+    /// First group of each time, then the number of groups.
+    pub group_times: Vec<usize>,
+    /// Features, `[entity rows, d]`.
+    pub entities: Vec<f32>,
+    /// Which of the group's entities each agent sees, itself left out: the groups' `[n, m]` one after another.
+    pub others: Vec<u8>,
+    /// Which actions each agent may take, `[agent rows, A]`.
+    pub available: Vec<u8>,
+    /// Actions taken, `[agent rows]`; 0 in bootstrap states.
+    pub actions: Vec<u8>,
+    /// Team reward of the step before, 0 at the first, `[groups]`.
+    pub previous_rewards: Vec<f32>,
+    /// Features of one entity, d.
+    pub entity_dim: usize,
+    /// Each episode's place in every time it reaches, by its index in the batch.
+    places: Vec<usize>,
+}
+
+impl Rows {
+    /// Lays out a batch of episodes.
+    pub fn of_episodes(episodes: &[&Episode]) -> Self {
+        let mut rows = Self::default();
+        rows.fill_from_episodes(episodes);
+        rows
+    }
+
+    /// Lays out a batch of episodes, keeping memory.
+    pub fn fill_from_episodes(&mut self, episodes: &[&Episode]) {
+        self.clear();
+        // A stable order: equal lengths keep the batch's order.
+        let mut order: Vec<usize> = (0..episodes.len()).collect();
+        order.sort_by_key(|&index| std::cmp::Reverse(episodes[index].steps()));
+        self.places.resize(episodes.len(), 0);
+        for (place, &index) in order.iter().enumerate() {
+            self.places[index] = place;
+        }
+        let longest = order.first().map_or(0, |&index| episodes[index].steps() + 1);
+        for time in 0..longest {
+            self.begin_time();
+            for &index in order.iter().take_while(|&&index| episodes[index].steps() >= time) {
+                self.push_episode_step(index, time, episodes[index]);
+            }
+        }
+        self.begin_time();
+    }
+
+    /// Lays out the present step of several running episodes: one time, actions unknown.
+    pub fn fill_from_turns(&mut self, turns: &[Turn<'_>]) {
+        self.clear();
+        self.begin_time();
+        for (index, turn) in turns.iter().enumerate() {
+            let seen = turn.observation;
+            let step = Step {
+                episode: index,
+                time: 0,
+                reward: 0.0,
+                filled: false,
+                terminated: false,
+                task: 0,
+            };
+            self.push_group(seen.n_agents(), seen.n_entities(), step, turn.previous_reward);
+            self.push_state(
+                seen.n_agents(),
+                seen.n_entities(),
+                seen.entities(),
+                seen.observable(),
+            );
+            self.available.extend_from_slice(seen.available());
+            self.places.push(index);
+        }
+        self.actions.resize(self.agent_rows(), 0);
+        self.begin_time();
+    }
+
+    /// Number of agent rows.
+    pub fn agent_rows(&self) -> usize {
+        self.groups.last().map_or(0, |group| group.queries.end)
+    }
+
+    /// Number of entity rows.
+    pub fn entity_rows(&self) -> usize {
+        self.groups.last().map_or(0, |group| group.keys.end)
+    }
+
+    /// Features, (entity rows, d).
+    pub fn entities(&self) -> View<'_> {
+        View {
+            data: &self.entities,
+            rows: self.entity_rows(),
+            cols: self.entity_dim,
+            stride: self.entity_dim,
+        }
+    }
+
+    /// The group of an episode, by its index in the batch, at a time it reaches.
+    pub fn group_of(&self, episode: usize, time: usize) -> usize {
+        self.group_times[time] + self.places[episode]
+    }
+
+    /// The group of the same episode one step later. Only for filled groups: every one of them has it.
+    pub fn next_group(&self, group: usize) -> usize {
+        let Step { episode, time, .. } = self.steps[group];
+        self.group_of(episode, time + 1)
+    }
+
+    /// The filled agent rows in the order (episode of the batch, time, agent): the order in which the
+    /// contrastive loss pairs them.
+    pub fn filled_agent_rows(&self) -> impl Iterator<Item = (usize, &Step)> {
+        (0..self.places.len()).flat_map(move |episode| {
+            let groups = (0..self.group_times.len() - 1)
+                .take_while(move |&time| {
+                    self.group_times[time] + self.places[episode] < self.group_times[time + 1]
+                })
+                .map(move |time| self.group_of(episode, time));
+            groups
+                .filter(|&group| self.steps[group].filled)
+                .flat_map(move |group| {
+                    self.groups[group]
+                        .queries
+                        .clone()
+                        .map(move |row| (row, &self.steps[group]))
+                })
+        })
+    }
+
+    fn clear(&mut self) {
+        self.groups.clear();
+        self.steps.clear();
+        self.agent_times.clear();
+        self.group_times.clear();
+        self.entities.clear();
+        self.others.clear();
+        self.available.clear();
+        self.actions.clear();
+        self.previous_rewards.clear();
+        self.places.clear();
+    }
+
+    fn begin_time(&mut self) {
+        self.agent_times.push(self.agent_rows());
+        self.group_times.push(self.groups.len());
+    }
+
+    fn push_episode_step(&mut self, index: usize, time: usize, episode: &Episode) {
+        let (n, m, steps) = (episode.n_agents, episode.n_entities, episode.steps());
+        let filled = time < steps;
+        let terminated = time + 1 == steps && episode.end == rit_episode::End::Terminated;
+        let reward = if filled { episode.rewards[time] } else { 0.0 };
+        let step = Step {
+            episode: index,
+            time,
+            reward,
+            filled,
+            terminated,
+            task: episode.task,
+        };
+        let d = episode.entities.len() / ((steps + 1) * m);
+        let n_actions = episode.available.len() / ((steps + 1) * n);
+        let part = |width: usize| time * width..(time + 1) * width;
+        self.push_group(
+            n,
+            m,
+            step,
+            if time == 0 { 0.0 } else { episode.rewards[time - 1] },
+        );
+        self.push_state(
+            n,
+            m,
+            &episode.entities[part(m * d)],
+            &episode.observable[part(n * m)],
+        );
+        self.available
+            .extend_from_slice(&episode.available[part(n * n_actions)]);
+        if filled {
+            self.actions.extend_from_slice(&episode.actions[part(n)]);
+        } else {
+            self.actions.resize(self.actions.len() + n, 0);
+        }
+    }
+
+    fn push_group(&mut self, n_agents: usize, n_entities: usize, step: Step, previous_reward: f32) {
+        let (agents, entities) = (self.agent_rows(), self.entity_rows());
+        self.groups.push(Group {
+            queries: agents..agents + n_agents,
+            keys: entities..entities + n_entities,
+        });
+        self.steps.push(step);
+        self.previous_rewards.push(previous_reward);
+    }
+
+    fn push_state(&mut self, n_agents: usize, n_entities: usize, entities: &[f32], observable: &[u8]) {
+        self.entity_dim = entities.len() / n_entities;
+        self.entities.extend_from_slice(entities);
+        let first = self.others.len();
+        self.others.extend_from_slice(observable);
+        for agent in 0..n_agents {
+            self.others[first + agent * n_entities + agent] = 0;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rit_episode::End;
+
+    /// An episode whose every number says where it belongs: entity feature = 100 · task + 10 · time + row.
+    fn episode(task: usize, n: usize, m: usize, steps: usize, end: End) -> Episode {
+        let rows = (0..=steps).flat_map(|time| (0..m).map(move |row| (100 * task + 10 * time + row) as f32));
+        Episode {
+            number: 0,
+            weights_version: 0,
+            task,
+            n_agents: n,
+            n_entities: m,
+            decision_order: rit_episode::decision_order::identity(n),
+            entities: rows.collect(),
+            observable: vec![1; (steps + 1) * n * m],
+            available: vec![1; (steps + 1) * n * 2],
+            actions: (0..steps * n).map(|row| (row % 2) as u8).collect(),
+            rewards: (0..steps).map(|time| time as f32 + 1.0).collect(),
+            end,
+            won: false,
+        }
+    }
+
+    #[test]
+    fn rows_lie_time_major_longest_first() {
+        let short = episode(1, 1, 2, 1, End::Truncated);
+        let long = episode(2, 2, 3, 2, End::Terminated);
+        let rows = Rows::of_episodes(&[&short, &long]);
+        // Time 0: long, short; time 1: long, short's bootstrap; time 2: long's bootstrap.
+        assert_eq!(rows.group_times, [0, 2, 4, 5]);
+        assert_eq!(rows.agent_times, [0, 3, 6, 8]);
+        let whose: Vec<_> = rows.steps.iter().map(|step| (step.episode, step.time)).collect();
+        assert_eq!(whose, [(1, 0), (0, 0), (1, 1), (0, 1), (1, 2)]);
+        let facts: Vec<_> = rows
+            .steps
+            .iter()
+            .map(|s| (s.filled, s.terminated, s.reward))
+            .collect();
+        let expected = [
+            (true, false, 1.0),
+            (true, false, 1.0),
+            (true, true, 2.0),
+            (false, false, 0.0),
+            (false, false, 0.0),
+        ];
+        assert_eq!(facts, expected);
+        let entities = [200, 201, 202, 100, 101, 210, 211, 212, 110, 111, 220, 221, 222];
+        assert_eq!(rows.entities, entities.map(|x| x as f32));
+        assert_eq!(rows.previous_rewards, [0.0, 0.0, 1.0, 1.0, 2.0]);
+        assert_eq!(rows.others[..8], [0, 1, 1, 1, 0, 1, 0, 1]);
+        assert_eq!(
+            (rows.next_group(0), rows.next_group(1), rows.next_group(2)),
+            (2, 3, 4)
+        );
+        // The contrastive order is the batch's: short's one row, then long's four.
+        let ordered: Vec<_> = rows
+            .filled_agent_rows()
+            .map(|(row, step)| (row, step.task))
+            .collect();
+        assert_eq!(ordered, [(2, 1), (0, 2), (1, 2), (3, 2), (4, 2)]);
+    }
+}

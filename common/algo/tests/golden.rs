@@ -1,0 +1,399 @@
+//! Parity with an independent implementation, tensor by tensor.
+//!
+//! Reads every folder under `RIT_GOLDEN_DIR`, by default the copy beside this file. All sizes come from the
+//! case's own `case.json`. The references were computed in float64 and stored as f32.
+
+use rit_algo::{Losses, Mixing, Rit, RitConfig, TaskRepresentations, Update, UpdateConfig};
+use rit_episode::{End, Episode, decision_order};
+use rit_nn::{Optimizer, OptimizerKind, optimizer};
+use safetensors::SafeTensors;
+use serde::Deserialize;
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    sync::Arc,
+};
+
+#[derive(Deserialize)]
+struct Case {
+    config: Sizes,
+    gamma: f32,
+    grad_norm_clip: f64,
+    optimizer: OptimizerConfig,
+    scalars: Scalars,
+}
+
+#[derive(Deserialize)]
+struct Sizes {
+    entity_dim: usize,
+    n_actions: usize,
+    agents_max: usize,
+    entities_max: usize,
+    hidden_dim: usize,
+    attention_dim: usize,
+    n_heads: usize,
+    task_representation_dim: usize,
+    reward_embed_dim: usize,
+    mixing_embed_dim: usize,
+    hypernet_embed_dim: usize,
+}
+
+#[derive(Deserialize)]
+#[serde(tag = "kind", rename_all = "lowercase")]
+enum OptimizerConfig {
+    RmsProp {
+        lr: f32,
+        eps: f32,
+        alpha: f32,
+    },
+    Adam {
+        lr: f32,
+        eps: f32,
+        betas: Option<[f32; 2]>,
+    },
+}
+
+#[derive(Deserialize)]
+struct Scalars {
+    td_loss: f64,
+    contrastive_loss: f64,
+    loss: f64,
+    grad_norm: f64,
+}
+
+#[test]
+fn every_case_agrees_with_the_reference() {
+    let root = std::env::var_os("RIT_GOLDEN_DIR").map_or_else(
+        || Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden"),
+        PathBuf::from,
+    );
+    let entries = fs::read_dir(&root).unwrap_or_else(|error| panic!("{}: {error}", root.display()));
+    let mut folders: Vec<_> = entries.map(|entry| entry.unwrap().path()).collect();
+    folders.retain(|folder| folder.join("case.json").is_file());
+    folders.sort();
+    assert!(!folders.is_empty(), "{} holds no case", root.display());
+    let mut differences = Vec::new();
+    for folder in &folders {
+        // However the batch is cut, the sums are the same within rounding.
+        for shards in [1, 2, 3] {
+            let mut report = Report {
+                case: format!("{}, {shards} shards", folder.display()),
+                differences: vec![],
+            };
+            compare(folder, shards, &mut report);
+            println!("{}: {} differences", report.case, report.differences.len());
+            differences.extend(report.differences);
+        }
+    }
+    assert!(
+        differences.is_empty(),
+        "{} differences:\n{}",
+        differences.len(),
+        differences.join("\n")
+    );
+}
+
+fn compare(folder: &Path, shards: usize, report: &mut Report) {
+    let case: Case = serde_json::from_slice(&fs::read(folder.join("case.json")).unwrap()).unwrap();
+    let read = |name: &str| Tensors(fs::read(folder.join(name).with_extension("safetensors")).unwrap());
+    let (batch, expected, gradients) = (read("batch"), read("expected"), read("gradients"));
+    let sizes = &case.config;
+    let rit = Rit::new(RitConfig {
+        entity_dim: sizes.entity_dim,
+        n_actions: sizes.n_actions,
+        hidden_dim: sizes.hidden_dim,
+        attention_dim: sizes.attention_dim,
+        n_heads: sizes.n_heads,
+        task_representations: Some(TaskRepresentations {
+            dim: sizes.task_representation_dim,
+            reward_embed_dim: sizes.reward_embed_dim,
+        }),
+        mixing: Mixing::Network {
+            mixing_embed_dim: sizes.mixing_embed_dim,
+            hypernet_embed_dim: sizes.hypernet_embed_dim,
+        },
+    });
+    let rit = Arc::new(rit.unwrap());
+    let (kind, lr) = match case.optimizer {
+        OptimizerConfig::RmsProp { lr, eps, alpha } => (OptimizerKind::RmsProp { alpha, eps }, lr),
+        OptimizerConfig::Adam { lr, eps, betas } => {
+            let [beta1, beta2] = betas.unwrap_or([0.9, 0.999]);
+            (OptimizerKind::Adam { beta1, beta2, eps }, lr)
+        }
+    };
+    let config = UpdateConfig {
+        gamma: case.gamma,
+        lr,
+        optimizer: kind,
+        grad_norm_clip: case.grad_norm_clip,
+        shards,
+        threads: 2,
+    };
+    let weights = flat(&rit, &read("weights"), 0..rit.layout.len());
+    let mut update = Update::new(Arc::clone(&rit), config, weights.clone()).unwrap();
+    update.target = flat(&rit, &read("target_weights"), rit.target());
+
+    let cells = Cells::read(&batch, sizes);
+    let episodes: Vec<Episode> = (0..cells.episodes())
+        .map(|index| cells.episode(&batch, sizes, index))
+        .collect();
+    let pairing: Vec<usize> = batch.i32("pairing").iter().map(|&row| row as usize).collect();
+    let losses = update.gradients(&episodes.iter().collect::<Vec<_>>(), |rows| {
+        assert_eq!(rows, pairing.len(), "one pair for each filled agent row");
+        pairing
+    });
+
+    compare_losses(&losses, &case.scalars, report);
+    compare_networks(&update, &cells, sizes, &expected, report);
+    for param in rit.layout.params() {
+        let name = format!("gradient of {}", param.name);
+        report.gradients(
+            &name,
+            &update.grads()[param.range.clone()],
+            &gradients.f32(&param.name),
+        );
+    }
+
+    // The optimiser, fed with the stored gradients.
+    let stored = flat(&rit, &gradients, 0..rit.layout.len());
+    let scale = optimizer::clip_scale(optimizer::norm(&stored), case.grad_norm_clip);
+    let mut stepped = weights;
+    Optimizer::new(kind, lr, stepped.len()).step(&mut stepped, &stored, scale);
+    let after = read("weights_after_step");
+    for param in rit.layout.params() {
+        let name = format!("{} after one step", param.name);
+        report.values(&name, &stepped[param.range.clone()], &after.f32(&param.name));
+    }
+}
+
+fn compare_losses(losses: &Losses, scalars: &Scalars, report: &mut Report) {
+    let pairs = [
+        ("td_loss", losses.td_loss, scalars.td_loss),
+        (
+            "contrastive_loss",
+            losses.contrastive_loss,
+            scalars.contrastive_loss,
+        ),
+        ("loss", losses.td_loss + losses.contrastive_loss, scalars.loss),
+        ("grad_norm", losses.grad_norm, scalars.grad_norm),
+    ];
+    for (name, ours, theirs) in pairs {
+        report.values(name, &[ours as f32], &[theirs as f32]);
+    }
+}
+
+/// Compares what is filled and real.
+fn compare_networks(update: &Update, cells: &Cells, sizes: &Sizes, expected: &Tensors, report: &mut Report) {
+    let (h, z, a) = (sizes.hidden_dim, sizes.task_representation_dim, sizes.n_actions);
+    let mut tensors: [(&str, Vec<f32>, Vec<f32>); 7] = [
+        "history",
+        "task_representation",
+        "utilities",
+        "q_total",
+        "target_q_total",
+        "td_target",
+        "greedy_actions",
+    ]
+    .map(|name| (name, vec![], vec![]));
+    let greedy = expected.i32("greedy_actions");
+    for (episode, &steps) in cells.steps.iter().enumerate() {
+        for time in 0..steps {
+            let at = |time| update.inspect(cells.episodes(), episode, time);
+            let (now, next) = (at(time), at(time + 1));
+            let cell = episode * cells.steps_max + time;
+            let state = episode * (cells.steps_max + 1) + time;
+            for (k, &row) in cells.agents[episode].iter().enumerate() {
+                let mut compare = |tensor: usize, ours: &[f32], cell: usize, width: usize| {
+                    let (name, all, reference) = &mut tensors[tensor];
+                    let theirs = expected.f32(name);
+                    all.extend_from_slice(&ours[k * width..][..width]);
+                    reference.extend_from_slice(&theirs[(cell * sizes.agents_max + row) * width..][..width]);
+                };
+                compare(0, now.history(), state, h);
+                compare(1, now.task_representation(), state, z);
+                compare(2, now.utilities(), cell, a);
+                tensors[6].1.push(f32::from(next.greedy_actions()[k]));
+                tensors[6].2.push(greedy[cell * sizes.agents_max + row] as f32);
+            }
+            for (tensor, ours) in [
+                (3, now.q_total()),
+                (4, next.target_q_total()),
+                (5, now.td_target()),
+            ] {
+                tensors[tensor].1.push(ours);
+                let theirs = expected.f32(tensors[tensor].0)[cell];
+                tensors[tensor].2.push(theirs);
+            }
+        }
+    }
+    for (name, ours, theirs) in &tensors {
+        report.values(name, ours, theirs);
+    }
+}
+
+/// Which cells of the padded batch are real.
+struct Cells {
+    steps_max: usize,
+    /// Filled steps of each episode.
+    steps: Vec<usize>,
+    /// Rows of real agents and of all real entities, by episode.
+    agents: Vec<Vec<usize>>,
+    entities: Vec<Vec<usize>>,
+}
+
+impl Cells {
+    fn read(batch: &Tensors, sizes: &Sizes) -> Self {
+        let (filled, present) = (batch.f32("filled"), batch.f32("present"));
+        let episodes = present.len() / sizes.entities_max;
+        let steps_max = filled.len() / episodes;
+        let steps = filled.chunks(steps_max).map(|filled| {
+            let steps = filled.iter().filter(|&&filled| filled == 1.0).count();
+            assert!(
+                filled[..steps].iter().all(|&filled| filled == 1.0),
+                "filled steps come first"
+            );
+            steps
+        });
+        let real = |present: &[f32], rows: usize| (0..rows).filter(|&row| present[row] == 1.0).collect();
+        let present = || present.chunks(sizes.entities_max);
+        Self {
+            steps_max,
+            steps: steps.collect(),
+            agents: present().map(|present| real(present, sizes.agents_max)).collect(),
+            entities: present()
+                .map(|present| real(present, sizes.entities_max))
+                .collect(),
+        }
+    }
+
+    fn episodes(&self) -> usize {
+        self.steps.len()
+    }
+
+    /// The real rows of one episode.
+    fn episode(&self, batch: &Tensors, sizes: &Sizes, index: usize) -> Episode {
+        let (d, a) = (sizes.entity_dim, sizes.n_actions);
+        let (n_max, m_max) = (sizes.agents_max, sizes.entities_max);
+        let (agents, others, steps) = (&self.agents[index], &self.entities[index], self.steps[index]);
+        let state = |time: usize| index * (self.steps_max + 1) + time;
+        let (entities, observable, available) = (
+            batch.f32("entities"),
+            batch.f32("observable"),
+            batch.f32("available"),
+        );
+        let (actions, rewards, terminated) = (
+            batch.i32("actions"),
+            batch.f32("rewards"),
+            batch.f32("terminated"),
+        );
+        let mut episode = Episode {
+            number: index as u64,
+            weights_version: 0,
+            task: batch.i32("task")[index] as usize,
+            n_agents: agents.len(),
+            n_entities: others.len(),
+            decision_order: decision_order::identity(agents.len()),
+            entities: vec![],
+            observable: vec![],
+            available: vec![],
+            actions: vec![],
+            rewards: rewards[index * self.steps_max..][..steps].to_vec(),
+            end: if terminated[index * self.steps_max + steps - 1] == 1.0 {
+                End::Terminated
+            } else {
+                End::Truncated
+            },
+            won: false,
+        };
+        for time in 0..=steps {
+            for &row in others {
+                episode
+                    .entities
+                    .extend_from_slice(&entities[(state(time) * m_max + row) * d..][..d]);
+            }
+            for &agent in agents {
+                let row = &observable[(state(time) * n_max + agent) * m_max..][..m_max];
+                episode
+                    .observable
+                    .extend(others.iter().map(|&entity| row[entity] as u8));
+                let row = &available[(state(time) * n_max + agent) * a..][..a];
+                episode.available.extend(row.iter().map(|&flag| flag as u8));
+            }
+            if time < steps {
+                let row = &actions[(index * self.steps_max + time) * n_max..][..n_max];
+                episode
+                    .actions
+                    .extend(agents.iter().map(|&agent| row[agent] as u8));
+            }
+        }
+        episode
+    }
+}
+
+/// Parameters by name, in the layout's order.
+fn flat(rit: &Rit, tensors: &Tensors, range: std::ops::Range<usize>) -> Vec<f32> {
+    let mut flat = Vec::new();
+    for param in rit
+        .layout
+        .params()
+        .iter()
+        .filter(|param| param.range.end <= range.end)
+    {
+        let values = tensors.f32(&param.name);
+        assert_eq!(values.len(), param.range.len(), "{}", param.name);
+        flat.extend(values);
+    }
+    flat
+}
+
+/// A safetensors file's bytes.
+struct Tensors(Vec<u8>);
+
+impl Tensors {
+    fn words(&self, name: &str) -> Vec<[u8; 4]> {
+        let tensors = SafeTensors::deserialize(&self.0).unwrap();
+        let tensor = tensors
+            .tensor(name)
+            .unwrap_or_else(|error| panic!("{name}: {error}"));
+        tensor.data().as_chunks::<4>().0.to_vec()
+    }
+
+    fn f32(&self, name: &str) -> Vec<f32> {
+        self.words(name).into_iter().map(f32::from_le_bytes).collect()
+    }
+
+    fn i32(&self, name: &str) -> Vec<i32> {
+        self.words(name).into_iter().map(i32::from_le_bytes).collect()
+    }
+}
+
+struct Report {
+    case: String,
+    differences: Vec<String>,
+}
+
+impl Report {
+    /// |a − b| ≤ 1e-4 · max|b| + 1e-6.
+    fn values(&mut self, name: &str, ours: &[f32], theirs: &[f32]) {
+        self.within(1e-4, name, ours, theirs);
+    }
+
+    /// |a − b| ≤ 5e-4 · max|b| + 1e-6.
+    fn gradients(&mut self, name: &str, ours: &[f32], theirs: &[f32]) {
+        self.within(5e-4, name, ours, theirs);
+    }
+
+    fn within(&mut self, relative: f32, name: &str, ours: &[f32], theirs: &[f32]) {
+        assert_eq!(ours.len(), theirs.len(), "{}: {name}", self.case);
+        assert!(!ours.is_empty(), "{}: {name} compares nothing", self.case);
+        let largest = theirs.iter().fold(0.0_f32, |largest, b| largest.max(b.abs()));
+        let tolerance = relative * largest + 1e-6;
+        let differs = |(_, (a, b)): &(usize, (&f32, &f32))| !matches!((*a - *b).abs().partial_cmp(&tolerance), Some(order) if order.is_le());
+        if let Some((at, (a, b))) = ours.iter().zip(theirs).enumerate().find(differs) {
+            let case = &self.case;
+            self.differences.push(format!(
+                "{case}: {name}[{at}] is {a}, reference {b}, tolerance {tolerance}"
+            ));
+        }
+    }
+}
