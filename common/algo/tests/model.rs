@@ -1,0 +1,292 @@
+//! The whole model on small random batches: numeric gradients of every parameter, acting against training,
+//! and independence of threads and of company.
+
+use rand::RngExt as _;
+use rit_algo::{
+    Acting, Mixing, Rit, RitConfig, TaskRepresentations, Update, UpdateConfig, contrastive::draw_pairing,
+};
+use rit_episode::{End, Episode, Observation, Policy, Rng, RunSeed, Stream, Turn, decision_order};
+use rit_nn::{OptimizerKind, gradcheck};
+use std::sync::Arc;
+
+const D: usize = 5;
+const A: usize = 3;
+
+fn config(n_heads: usize, task_representations: bool, mixing_network: bool) -> RitConfig {
+    RitConfig {
+        entity_dim: D,
+        n_actions: A,
+        hidden_dim: 6,
+        attention_dim: 4,
+        n_heads,
+        task_representations: task_representations.then_some(TaskRepresentations {
+            dim: 3,
+            reward_embed_dim: 2,
+        }),
+        mixing: if mixing_network {
+            Mixing::Network {
+                mixing_embed_dim: 4,
+                hypernet_embed_dim: 5,
+            }
+        } else {
+            Mixing::Sum
+        },
+    }
+}
+
+/// An episode of random content: blind and partly blind agents, unavailable actions.
+fn episode(task: usize, n: usize, m: usize, steps: usize, end: End, rng: &mut Rng) -> Episode {
+    let mut available: Vec<u8> = (0..(steps + 1) * n * A).map(|_| rng.random_range(0..2)).collect();
+    let actions: Vec<u8> = (0..steps * n).map(|_| rng.random_range(0..A) as u8).collect();
+    for (row, &action) in actions.iter().enumerate() {
+        available[row * A + usize::from(action)] = 1;
+    }
+    Episode {
+        number: 0,
+        weights_version: 0,
+        task,
+        n_agents: n,
+        n_entities: m,
+        decision_order: decision_order::identity(n),
+        entities: (0..(steps + 1) * m * D)
+            .map(|_| rng.random_range(-1.0..1.0))
+            .collect(),
+        observable: (0..(steps + 1) * n * m)
+            .map(|_| u8::from(rng.random_range(0..3) > 0))
+            .collect(),
+        available,
+        actions,
+        rewards: (0..steps).map(|_| rng.random_range(-1.0..1.0)).collect(),
+        end,
+        won: false,
+    }
+}
+
+/// Tasks of different sizes, lengths and ends.
+fn batch(seed: u64) -> Vec<Episode> {
+    let rng = &mut RunSeed(seed).stream(Stream::Environment, 0);
+    vec![
+        episode(0, 2, 3, 3, End::Terminated, rng),
+        episode(1, 3, 5, 2, End::Truncated, rng),
+        episode(0, 2, 3, 1, End::Terminated, rng),
+        episode(2, 1, 1, 3, End::Truncated, rng),
+        episode(1, 3, 5, 3, End::Truncated, rng),
+    ]
+}
+
+fn update(rit: &Arc<Rit>, shards: usize, threads: usize, params: Vec<f32>) -> Update {
+    let optimizer = OptimizerKind::Adam {
+        beta1: 0.9,
+        beta2: 0.999,
+        eps: 1e-8,
+    };
+    let config = UpdateConfig {
+        gamma: 0.9,
+        lr: 1e-2,
+        optimizer,
+        grad_norm_clip: 10.0,
+        shards,
+        threads,
+    };
+    Update::new(Arc::clone(rit), config, params).unwrap()
+}
+
+/// Parameters large enough that no gradient hides in rounding.
+fn params(rit: &Rit, seed: u64) -> Vec<f32> {
+    gradcheck::noise(seed, rit.layout.len())
+        .iter()
+        .map(|x| 0.7 * x)
+        .collect()
+}
+
+#[test]
+fn every_parameters_gradient_is_the_numeric_one() {
+    for (heads, representations, network) in [
+        (1, true, true),
+        (2, true, true),
+        (2, false, true),
+        (2, true, false),
+        (1, false, false),
+    ] {
+        let rit = Arc::new(Rit::new(config(heads, representations, network)).unwrap());
+        let episodes = batch(7);
+        let batch: Vec<&Episode> = episodes.iter().collect();
+        let at = params(&rit, 4);
+        let mut update = update(&rit, 2, 1, at.clone());
+        // The target stays where it is while the online parameters move.
+        update.target = gradcheck::noise(5, update.target.len());
+        let pairing = |rows| draw_pairing(rows, &mut RunSeed(1).stream(Stream::Pairing, 0));
+        update.gradients(&batch, pairing);
+        let grads = update.grads().to_vec();
+        let mut moved = at.clone();
+        for param in rit.layout.params() {
+            let range = param.range.clone();
+            if param.name.ends_with("attention.key.bias") {
+                // Softmax does not see what is added to every score: the true gradient is zero.
+                let largest = grads[range]
+                    .iter()
+                    .fold(0.0_f32, |largest, g| largest.max(g.abs()));
+                assert!(largest < 1e-5, "{}: {largest}", param.name);
+                continue;
+            }
+            let cell = std::cell::RefCell::new((&mut update, &mut moved));
+            gradcheck::check(&param.name, &at[range.clone()], &grads[range.clone()], |values| {
+                let (update, moved) = &mut *cell.borrow_mut();
+                moved[range.clone()].copy_from_slice(values);
+                update.params.copy_from_slice(moved);
+                let losses = update.gradients(&batch, pairing);
+                moved[range.clone()].copy_from_slice(&at[range.clone()]);
+                losses.td_loss + losses.contrastive_loss
+            });
+        }
+    }
+}
+
+/// Plays an episode's observations to a policy, step by step, and forces the recorded actions by making
+/// nothing else available.
+fn replay(acting: &mut Acting, slots: &[(usize, &Episode)]) -> Vec<Vec<f32>> {
+    let mut utilities = vec![vec![]; slots.len()];
+    for &(slot, episode) in slots {
+        acting.begin(slot, episode.n_agents);
+    }
+    let longest = slots
+        .iter()
+        .map(|(_, episode)| episode.steps())
+        .max()
+        .unwrap_or(0);
+    for time in 0..longest {
+        let running: Vec<usize> = (0..slots.len()).filter(|&i| time < slots[i].1.steps()).collect();
+        let mut seen: Vec<(Observation, Vec<u8>, Rng)> = running
+            .iter()
+            .map(|&i| {
+                let episode = slots[i].1;
+                let (n, m) = (episode.n_agents, episode.n_entities);
+                let mut observation = Observation::new(n, m, D, A);
+                for row in 0..m {
+                    observation
+                        .entity_mut(row)
+                        .copy_from_slice(&episode.entities[(time * m + row) * D..][..D]);
+                }
+                for agent in 0..n {
+                    let row = time * n + agent;
+                    observation
+                        .observable_mut(agent)
+                        .copy_from_slice(&episode.observable[row * m..][..m]);
+                    observation.available_mut(agent)[usize::from(episode.actions[row])] = 1;
+                }
+                (observation, vec![0; n], RunSeed(0).stream(Stream::Exploration, 0))
+            })
+            .collect();
+        let mut turns: Vec<Turn<'_>> = seen
+            .iter_mut()
+            .zip(&running)
+            .map(|((observation, actions, exploration), &i)| Turn {
+                slot: slots[i].0,
+                observation,
+                previous_reward: if time == 0 {
+                    0.0
+                } else {
+                    slots[i].1.rewards[time - 1]
+                },
+                epsilon: 0.0,
+                exploration,
+                actions,
+            })
+            .collect();
+        acting.act(&mut turns);
+        let mut rest = acting.utilities();
+        for &i in &running {
+            let (mine, others) = rest.split_at(slots[i].1.n_agents * A);
+            utilities[i].extend_from_slice(mine);
+            rest = others;
+        }
+    }
+    utilities
+}
+
+#[test]
+fn acting_row_by_row_equals_the_masked_parallel_pass() {
+    for representations in [true, false] {
+        let rit = Arc::new(Rit::new(config(2, representations, true)).unwrap());
+        let at = params(&rit, 3);
+        let episodes = batch(11);
+        let batch: Vec<&Episode> = episodes.iter().collect();
+        let mut update = update(&rit, 1, 1, at.clone());
+        update.gradients(&batch, |rows| (0..rows).collect());
+        let mut acting = Acting::new(Arc::clone(&rit), &at[rit.acting()]);
+        let slots: Vec<_> = batch.iter().copied().enumerate().collect();
+        for ((index, episode), acted) in slots.iter().zip(replay(&mut acting, &slots)) {
+            for time in 0..episode.steps() {
+                let trained = update.inspect(batch.len(), *index, time).utilities();
+                let acted = &acted[time * episode.n_agents * A..][..episode.n_agents * A];
+                for (a, b) in acted.iter().zip(trained) {
+                    assert!(
+                        (a - b).abs() <= 1e-5 * b.abs().max(1.0),
+                        "episode {index} step {time}: {a} {b}"
+                    );
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn acting_does_not_depend_on_company() {
+    let rit = Arc::new(Rit::new(config(2, true, true)).unwrap());
+    let at = params(&rit, 3);
+    let episodes = batch(13);
+    let together: Vec<_> = episodes.iter().enumerate().collect();
+    let all = replay(&mut Acting::new(Arc::clone(&rit), &at[rit.acting()]), &together);
+    for (index, episode) in episodes.iter().enumerate() {
+        let alone = replay(
+            &mut Acting::new(Arc::clone(&rit), &at[rit.acting()]),
+            &[(3, episode)],
+        );
+        assert_eq!(alone[0], all[index], "episode {index}, bit for bit");
+    }
+}
+
+#[test]
+fn threads_change_no_bit() {
+    let rit = Arc::new(Rit::new(config(2, true, true)).unwrap());
+    let run = |threads| {
+        let mut update = update(&rit, 3, threads, params(&rit, 3));
+        for step in 0..5 {
+            let episodes = batch(step);
+            let rng = &mut RunSeed(9).stream(Stream::Pairing, step);
+            update.step(&episodes.iter().collect::<Vec<_>>(), rng);
+            update.update_target();
+        }
+        update.params
+    };
+    let alone = run(1);
+    assert_eq!(alone, run(2));
+    assert_eq!(alone, run(4));
+}
+
+#[test]
+fn exploration_is_uniform_over_what_is_available() {
+    let rit = Arc::new(Rit::new(config(1, true, true)).unwrap());
+    let at = params(&rit, 3);
+    let mut acting = Acting::new(Arc::clone(&rit), &at[rit.acting()]);
+    let mut observation = Observation::new(1, 1, D, A);
+    observation.available_mut(0).copy_from_slice(&[1, 0, 1]);
+    let exploration = &mut RunSeed(0).stream(Stream::Exploration, 0);
+    let mut counts = [0; A];
+    for _ in 0..2000 {
+        acting.begin(0, 1);
+        let mut actions = [9];
+        acting.act(&mut [Turn {
+            slot: 0,
+            observation: &observation,
+            previous_reward: 0.0,
+            epsilon: 1.0,
+            exploration,
+            actions: &mut actions,
+        }]);
+        counts[usize::from(actions[0])] += 1;
+    }
+    assert_eq!(counts[1], 0);
+    // 1000 expected, standard deviation 22.
+    assert!((890..1110).contains(&counts[0]), "{counts:?}");
+}
