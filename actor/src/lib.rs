@@ -1,1 +1,10 @@
-//! x
+//! An actor: rolls the episodes it is leased and sends them to the learner, until either wants no more.
+//!
+//! [`run`] speaks gRPC on the runtime: leases come in, weights are watched. [`rollout`] is one thread that acts
+//! and sends; it takes other weights only between leases.
+
+mod rollout;
+mod run;
+mod weights;
+
+pub use run::{ActorError, ActorOptions, run};

@@ -1,2 +1,50 @@
-//! x
-fn main() {}
+//! The `rit` binary: one program, many processes. `rit train` starts `rit learner` and several `rit actor` by
+//! executing itself; the same sub-commands are what a service unit or a cluster starts.
+
+mod cli;
+mod ctl;
+mod evaluate;
+mod experiments;
+mod failure;
+mod logging;
+mod processes;
+mod progress;
+mod report;
+mod shutdown;
+mod supervisor;
+mod train;
+
+use clap::Parser as _;
+use cli::{Cli, Command};
+use failure::Failure;
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
+    let result = match runtime {
+        Ok(runtime) => {
+            let result = runtime.block_on(run(cli));
+            // A rollout or an evaluation that nobody waits for any more is not waited for here either.
+            runtime.shutdown_background();
+            result
+        }
+        Err(error) => Err(Failure::runtime(error)),
+    };
+    match result {
+        Ok(code) => code,
+        Err(failure) => failure.report(),
+    }
+}
+
+async fn run(cli: Cli) -> Result<ExitCode, Failure> {
+    let logs = cli.logs;
+    match cli.command {
+        Command::Train(options) => train::run(options, logs).await,
+        Command::Learner(options) => processes::learner(options, logs).await,
+        Command::Actor(options) => processes::actor(options, logs).await,
+        Command::Evaluate(options) => evaluate::run(&options),
+        Command::Ctl(options) => ctl::run(options).await,
+        Command::Experiments => experiments::print(),
+    }
+}

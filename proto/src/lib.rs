@@ -1,1 +1,19 @@
-//! x
+//! The `rit.v1` gRPC packages (see the .proto files beside this crate) and the ways to reach them.
+
+pub mod transport;
+
+/// Generated from `rit/v1/*.proto`, where every message is documented.
+#[allow(missing_docs, unused_qualifications, clippy::all, reason = "generated code")]
+pub mod v1 {
+    tonic::include_proto!("rit.v1");
+}
+
+/// Largest message either side accepts: weights of a large model, with room.
+pub const MESSAGE_BYTES_MAX: usize = 256 << 20;
+
+/// A run's state as JSON has it: `"running"`, `"paused"`, `"stopping"`.
+fn state_name<S: serde::Serializer>(state: &i32, serializer: S) -> Result<S::Ok, S::Error> {
+    let state = v1::RunState::try_from(*state).unwrap_or_default();
+    let name = state.as_str_name().trim_start_matches("RUN_STATE_").to_ascii_lowercase();
+    serializer.serialize_str(&name)
+}

@@ -51,11 +51,7 @@ impl Acting {
     /// # Panics
     /// When there are not as many as acting needs.
     pub fn set_params(&mut self, params: &[f32]) {
-        assert_eq!(
-            params.len(),
-            self.rit.acting().len(),
-            "the parameters that acting needs"
-        );
+        assert_eq!(params.len(), self.rit.acting().len(), "the parameters that acting needs");
         self.params.clear();
         self.params.extend_from_slice(params);
         self.tables = self.rit.utility.decoder.tables(&self.params);
@@ -79,10 +75,7 @@ impl Policy for Acting {
             self.memories.resize_with(slot + 1, Memory::default);
         }
         let len = n_agents * self.rit.config.hidden_dim;
-        let Memory {
-            utility,
-            task_encoder,
-        } = &mut self.memories[slot];
+        let Memory { utility, task_encoder } = &mut self.memories[slot];
         for state in [utility, task_encoder] {
             state.clear();
             state.resize(len, 0.0);
@@ -91,23 +84,13 @@ impl Policy for Acting {
 
     fn act(&mut self, turns: &mut [Turn<'_>]) {
         let (h, n_actions) = (self.rit.config.hidden_dim, self.rit.config.n_actions);
-        let Self {
-            rit,
-            params,
-            tables,
-            memories,
-            rows,
-            networks,
-            before,
-        } = self;
+        let Self { rit, params, tables, memories, rows, networks, before } = self;
         rows.fill_from_turns(turns);
         before.utility.clear();
         before.task_encoder.clear();
         for turn in turns.iter() {
             before.utility.extend_from_slice(&memories[turn.slot].utility);
-            before
-                .task_encoder
-                .extend_from_slice(&memories[turn.slot].task_encoder);
+            before.task_encoder.extend_from_slice(&memories[turn.slot].task_encoder);
         }
         let before = Before {
             utility: Some(View::dense(&before.utility, h)),
@@ -117,13 +100,9 @@ impl Policy for Acting {
         for (group, turn) in rows.groups.iter().zip(turns.iter()) {
             let states = group.queries.start * h..group.queries.end * h;
             let memory = &mut memories[turn.slot];
-            memory
-                .utility
-                .copy_from_slice(&networks.utility.history()[states.clone()]);
+            memory.utility.copy_from_slice(&networks.utility.history()[states.clone()]);
             if rit.task_encoder.is_some() {
-                memory
-                    .task_encoder
-                    .copy_from_slice(&networks.task_encoder.history()[states]);
+                memory.task_encoder.copy_from_slice(&networks.task_encoder.history()[states]);
             }
         }
 
@@ -137,11 +116,8 @@ impl Policy for Acting {
                     let utilities = rit.utility.decoder.decide(params, tables, row, &seen, decoder);
                     // Drawn whatever ε is, so that the stream stays in step.
                     let explores = turn.exploration.random::<f32>() < turn.epsilon;
-                    *action = if explores {
-                        any(available, turn.exploration)
-                    } else {
-                        best(utilities, available)
-                    };
+                    *action =
+                        if explores { any(available, turn.exploration) } else { best(utilities, available) };
                     seen.push(*action);
                 }
             }

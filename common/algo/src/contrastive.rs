@@ -56,17 +56,10 @@ impl Discriminator {
         }
 
         let mut d_hidden = ViewMut::dense(fit(&mut state.d_hidden, count * h), h);
-        self.out.backward(
-            params,
-            hidden,
-            View::dense(logits, 1),
-            Some(d_hidden.reborrow()),
-            grads,
-        );
+        self.out.backward(params, hidden, View::dense(logits, 1), Some(d_hidden.reborrow()), grads);
         activation::relu_backward(hidden, d_hidden.reborrow());
         let d_pairs = ViewMut::dense(fit(&mut state.d_pairs, count * pairs.cols), pairs.cols);
-        self.hidden
-            .backward(params, pairs, d_hidden.as_view(), Some(d_pairs), grads);
+        self.hidden.backward(params, pairs, d_hidden.as_view(), Some(d_pairs), grads);
         loss
     }
 }

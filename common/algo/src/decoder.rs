@@ -106,30 +106,13 @@ impl Decoder {
     ) -> Self {
         let tokens = n_actions + 1;
         let bound = 1.0 / (tokens as f32).sqrt();
-        let action_embed = layout.add(
-            format!("{name}.action_embed.weight"),
-            &[hidden_dim, tokens],
-            bound,
-        );
-        let action_attention = Attention::new(
-            layout,
-            &format!("{name}.action_attention"),
-            hidden_dim,
-            attention_dim,
-            heads,
-        );
+        let action_embed = layout.add(format!("{name}.action_embed.weight"), &[hidden_dim, tokens], bound);
+        let action_attention =
+            Attention::new(layout, &format!("{name}.action_attention"), hidden_dim, attention_dim, heads);
         let inputs = hidden_dim + attention_dim + representation_dim;
         let head_hidden = Linear::new(layout, &format!("{name}.head_hidden"), inputs, hidden_dim);
         let head = Linear::new(layout, &format!("{name}.head"), hidden_dim, n_actions);
-        Self {
-            action_embed,
-            action_attention,
-            head_hidden,
-            head,
-            n_actions,
-            hidden_dim,
-            representation_dim,
-        }
+        Self { action_embed, action_attention, head_hidden, head, n_actions, hidden_dim, representation_dim }
     }
 
     fn tokens(&self) -> usize {
@@ -157,9 +140,7 @@ impl Decoder {
             tables.tokens.extend((0..h).map(|i| embed.row(i)[token].max(0.0)));
         }
         let mut key_values = ViewMut::dense(fit(&mut tables.key_values, k * 2 * a), 2 * a);
-        attention
-            .key_value
-            .forward(params, View::dense(&tables.tokens, h), key_values.reborrow());
+        attention.key_value.forward(params, View::dense(&tables.tokens, h), key_values.reborrow());
         activation::relu(key_values.columns(a..2 * a));
 
         fit(&mut tables.scores, heads * k * h);
@@ -203,11 +184,7 @@ impl Decoder {
             let d_bias = &d.score_bias[head * k..(head + 1) * k];
             let (_, context, _) = self.head_columns(head);
 
-            matmul::dyt_x(
-                keys,
-                d_scores,
-                attention.query.weight_mut(grads).rows(columns.clone()),
-            );
+            matmul::dyt_x(keys, d_scores, attention.query.weight_mut(grads).rows(columns.clone()));
             let query_bias = &mut attention.query.bias_mut(grads)[columns.clone()];
             for (token, &d_bias) in d_bias.iter().enumerate() {
                 math::add_scaled(query_bias, d_bias, keys.row(token));
@@ -295,9 +272,8 @@ impl Decoder {
         for attention_head in 0..heads {
             let part = attention_head * k..(attention_head + 1) * k;
             counted_softmax(&scores[part.clone()], &seen.counts, &mut weights[part.clone()]);
-            for (&weight, context) in weights[part.clone()]
-                .iter()
-                .zip(tables.contexts[part.start * h..].chunks(h))
+            for (&weight, context) in
+                weights[part.clone()].iter().zip(tables.contexts[part.start * h..].chunks(h))
             {
                 if weight != 0.0 {
                     math::add_scaled(hidden, weight, context);
@@ -357,10 +333,7 @@ impl Decoder {
 
     /// Takes `d_utilities` (R, A). Writes `d_history` (R, h), adds to `d_representation` (R, h_z) and to the
     /// parameters' gradients.
-    #[allow(
-        clippy::too_many_arguments,
-        reason = "a matrix and its companions, each named"
-    )]
+    #[allow(clippy::too_many_arguments, reason = "a matrix and its companions, each named")]
     pub fn backward(
         &self,
         params: &[f32],
@@ -377,34 +350,17 @@ impl Decoder {
         let rows = history.rows;
         let hidden = View::dense(&state.hidden, h);
         let mut d_hidden = ViewMut::dense(fit(&mut state.d_hidden, rows * h), h);
-        self.head
-            .backward(params, hidden, d_utilities, Some(d_hidden.reborrow()), grads);
+        self.head.backward(params, hidden, d_utilities, Some(d_hidden.reborrow()), grads);
         activation::relu_backward(hidden, d_hidden);
         let d_hidden = View::dense(&state.d_hidden, h);
 
-        let mut d = Tables {
-            contexts: vec![0.0; width * h],
-            scores: vec![0.0; width * h],
-            ..Tables::default()
-        };
-        matmul::dyt_x(
-            View::dense(&state.weights, width),
-            d_hidden,
-            ViewMut::dense(&mut d.contexts, h),
-        );
+        let mut d =
+            Tables { contexts: vec![0.0; width * h], scores: vec![0.0; width * h], ..Tables::default() };
+        matmul::dyt_x(View::dense(&state.weights, width), d_hidden, ViewMut::dense(&mut d.contexts, h));
         let mut d_scores = ViewMut::dense(fit(&mut state.d_weights, rows * width), width);
-        matmul::x_wt(
-            d_hidden,
-            View::dense(&tables.contexts, h),
-            d_scores.reborrow(),
-            Accum::Replace,
-        );
+        matmul::x_wt(d_hidden, View::dense(&tables.contexts, h), d_scores.reborrow(), Accum::Replace);
         math::vectorized(|| {
-            for (d_weights, weights) in d_scores
-                .data
-                .chunks_exact_mut(k)
-                .zip(state.weights.chunks_exact(k))
-            {
+            for (d_weights, weights) in d_scores.data.chunks_exact_mut(k).zip(state.weights.chunks_exact(k)) {
                 softmax_backward(weights, d_weights);
             }
         });
@@ -412,12 +368,7 @@ impl Decoder {
         matmul::dyt_x(d_scores, history, ViewMut::dense(&mut d.scores, h));
         d.score_bias = vec![0.0; width];
         linear::add_column_sums(d_scores, &mut d.score_bias);
-        matmul::dy_w(
-            d_scores,
-            View::dense(&tables.scores, h),
-            d_history.reborrow(),
-            Accum::Replace,
-        );
+        matmul::dy_w(d_scores, View::dense(&tables.scores, h), d_history.reborrow(), Accum::Replace);
 
         let (tau, _, z) = self.head_columns(0);
         let weight = self.head_hidden.weight(params);
@@ -425,11 +376,7 @@ impl Decoder {
         matmul::dyt_x(d_hidden, history, self.head_hidden.weight_mut(grads).columns(tau));
         if self.representation_dim > 0 {
             matmul::dy_w(d_hidden, weight.columns(z.clone()), d_representation, Accum::Add);
-            matmul::dyt_x(
-                d_hidden,
-                representation,
-                self.head_hidden.weight_mut(grads).columns(z),
-            );
+            matmul::dyt_x(d_hidden, representation, self.head_hidden.weight_mut(grads).columns(z));
         }
         linear::add_column_sums(d_hidden, self.head_hidden.bias_mut(grads));
         self.tables_backward(params, tables, d, grads);
@@ -439,10 +386,7 @@ impl Decoder {
 /// The keys and the values of one head's columns, (K, head dim) each.
 fn keys_and_values(key_values: &[f32], a: usize, columns: Range<usize>) -> (View<'_>, View<'_>) {
     let both = View::dense(key_values, 2 * a);
-    (
-        both.columns(columns.clone()),
-        both.columns(a + columns.start..a + columns.end),
-    )
+    (both.columns(columns.clone()), both.columns(a + columns.start..a + columns.end))
 }
 
 /// The available action of the largest utility, the lowest index among equals; 0 where none is available.
@@ -467,11 +411,7 @@ fn counted_softmax(scores: &[f32], counts: &[f32], weights: &mut [f32]) {
     }
     let mut total = 0.0;
     for ((weight, &score), &count) in weights.iter_mut().zip(scores).zip(counts) {
-        *weight = if count > 0.0 {
-            count * math::exp(score - largest)
-        } else {
-            0.0
-        };
+        *weight = if count > 0.0 { count * math::exp(score - largest) } else { 0.0 };
         total += *weight;
     }
     // The start token is always seen, so the total is not zero.

@@ -40,13 +40,8 @@ impl Encoder {
         heads: usize,
     ) -> Self {
         let embed = Linear::new(layout, &format!("{name}.embed"), entity_dim, hidden_dim);
-        let attention = Attention::new(
-            layout,
-            &format!("{name}.attention"),
-            hidden_dim,
-            attention_dim,
-            heads,
-        );
+        let attention =
+            Attention::new(layout, &format!("{name}.attention"), hidden_dim, attention_dim, heads);
         Self { embed, attention }
     }
 
@@ -64,8 +59,7 @@ impl Encoder {
     pub fn forward(&self, params: &[f32], rows: &Rows, visible: Visible<'_>, state: &mut EncoderState) {
         let (h, width) = (self.hidden_dim(), self.width());
         let x = fit(&mut state.x, rows.entity_rows() * h);
-        self.embed
-            .forward_relu(params, rows.entities(), ViewMut::dense(x, h));
+        self.embed.forward_relu(params, rows.entities(), ViewMut::dense(x, h));
         let queries = fit(&mut state.queries, rows.agent_rows() * h);
         let encoded = fit(&mut state.encoded, rows.agent_rows() * width);
         for group in &rows.groups {
@@ -77,15 +71,7 @@ impl Encoder {
         }
         let (queries, keys) = (View::dense(queries, h), View::dense(&state.x, h));
         let out = ViewMut::dense(encoded, width).columns(h..width);
-        self.attention.forward(
-            params,
-            queries,
-            keys,
-            &rows.groups,
-            visible,
-            &mut state.attention,
-            out,
-        );
+        self.attention.forward(params, queries, keys, &rows.groups, visible, &mut state.attention, out);
     }
 
     /// Takes `d_encoded` (R, h + a) and adds to the parameters' gradients.
@@ -104,17 +90,7 @@ impl Encoder {
         let keys = View::dense(&state.x, h);
         let d_out = d_encoded.columns(h..width);
         let attention = &mut state.attention;
-        self.attention.backward(
-            params,
-            queries,
-            keys,
-            &rows.groups,
-            attention,
-            d_out,
-            d_queries,
-            d_x,
-            grads,
-        );
+        self.attention.backward(params, queries, keys, &rows.groups, attention, d_out, d_queries, d_x, grads);
         // An agent's x is a key, a query and a part of its encoded row.
         math::vectorized(|| {
             for group in &rows.groups {
@@ -126,7 +102,6 @@ impl Encoder {
             }
         });
         activation::relu_backward(View::dense(&state.x, h), ViewMut::dense(&mut state.d_x, h));
-        self.embed
-            .backward_params(rows.entities(), View::dense(&state.d_x, h), grads);
+        self.embed.backward_params(rows.entities(), View::dense(&state.d_x, h), grads);
     }
 }

@@ -69,24 +69,13 @@ impl Mixer {
         let (h, a, x, y) = (config.hidden_dim, config.attention_dim, mixing_dim, hypernet_dim);
         let encoder = Encoder::new(layout, "mixer", config.entity_dim, h, a, config.n_heads);
         let out = Linear::new(layout, "mixer.out", a, h);
-        let layers = [
-            ("mixer.w1_hidden", y),
-            ("mixer.w2_hidden", y),
-            ("mixer.b2_hidden", x),
-            ("mixer.b1", x),
-        ];
+        let layers =
+            [("mixer.w1_hidden", y), ("mixer.w2_hidden", y), ("mixer.b2_hidden", x), ("mixer.b1", x)];
         let hyper = Linear::side_by_side(layout, h + config.representation_dim(), &layers);
         let w1 = Linear::new(layout, "mixer.w1", y, x);
         let w2 = Linear::new(layout, "mixer.w2", y, x);
         let b2 = Linear::new(layout, "mixer.b2", x, 1);
-        Self {
-            encoder,
-            out,
-            hyper,
-            w1,
-            w2,
-            b2,
-        }
+        Self { encoder, out, hyper, w1, w2, b2 }
     }
 
     fn mixing_dim(&self) -> usize {
@@ -110,8 +99,7 @@ impl Mixer {
     ) {
         let (h, x, y) = (self.out.outputs, self.mixing_dim(), self.w1.inputs);
         let (agents, groups) = (rows.agent_rows(), rows.groups.len());
-        self.encoder
-            .forward(params, rows, Visible::All, &mut state.encoder);
+        self.encoder.forward(params, rows, Visible::All, &mut state.encoder);
         let attended = View::dense(&state.encoder.encoded, self.encoder.width())
             .columns(self.encoder.hidden_dim()..self.encoder.width());
         let width = self.hyper.inputs;
@@ -123,8 +111,7 @@ impl Mixer {
 
         let outputs = self.hyper.outputs;
         let mut hyper = ViewMut::dense(fit(&mut state.hyper, agents * outputs), outputs);
-        self.hyper
-            .forward(params, View::dense(&state.context, width), hyper.reborrow());
+        self.hyper.forward(params, View::dense(&state.context, width), hyper.reborrow());
         activation::relu(hyper.reborrow().columns(0..2 * y + x));
         let w1 = ViewMut::dense(fit(&mut state.w1, agents * x), x);
         self.w1.forward(params, hyper.as_view().columns(0..y), w1);
@@ -142,16 +129,8 @@ impl Mixer {
         });
         let (w2_hidden, b2_hidden, b1) = self.mean_columns();
         let means = View::dense(means, mean_width);
-        self.w2.forward(
-            params,
-            means.columns(w2_hidden),
-            ViewMut::dense(fit(&mut state.w2, groups * x), x),
-        );
-        self.b2.forward(
-            params,
-            means.columns(b2_hidden),
-            ViewMut::dense(fit(&mut state.b2, groups), 1),
-        );
+        self.w2.forward(params, means.columns(w2_hidden), ViewMut::dense(fit(&mut state.w2, groups * x), x));
+        self.b2.forward(params, means.columns(b2_hidden), ViewMut::dense(fit(&mut state.b2, groups), 1));
 
         let hidden = fit(&mut state.hidden, groups * x);
         let q_total = fit(&mut state.q_total, groups);
@@ -176,10 +155,7 @@ impl Mixer {
 
     /// Takes `d_total` (G). Writes `d_q` (R), adds to `d_representation` (R, h_z) and to the parameters'
     /// gradients. `q` is what forward was given.
-    #[allow(
-        clippy::too_many_arguments,
-        reason = "a matrix and its companions, each named"
-    )]
+    #[allow(clippy::too_many_arguments, reason = "a matrix and its companions, each named")]
     pub fn backward(
         &self,
         params: &[f32],
@@ -219,27 +195,14 @@ impl Mixer {
         let d_w2 = View::dense(&state.w2, x);
         let mut d_means = ViewMut::dense(d_means, mean_width);
         let to = d_means.reborrow().columns(w2_hidden.clone());
-        self.w2
-            .backward(params, means.columns(w2_hidden), d_w2, Some(to), grads);
+        self.w2.backward(params, means.columns(w2_hidden), d_w2, Some(to), grads);
         let to = d_means.reborrow().columns(b2_hidden.clone());
-        self.b2.backward(
-            params,
-            means.columns(b2_hidden),
-            View::dense(d_total, 1),
-            Some(to),
-            grads,
-        );
+        self.b2.backward(params, means.columns(b2_hidden), View::dense(d_total, 1), Some(to), grads);
 
         let hyper = View::dense(&state.hyper, outputs);
         let mut d_hyper = ViewMut::dense(fit(&mut state.d_hyper, agents * outputs), outputs);
         let to = d_hyper.reborrow().columns(0..y);
-        self.w1.backward(
-            params,
-            hyper.columns(0..y),
-            View::dense(&state.w1, x),
-            Some(to),
-            grads,
-        );
+        self.w1.backward(params, hyper.columns(0..y), View::dense(&state.w1, x), Some(to), grads);
         for (at, group) in rows.groups.iter().enumerate() {
             let share = 1.0 / group.queries.len() as f32;
             for row in group.queries.clone() {
@@ -252,8 +215,7 @@ impl Mixer {
         activation::relu_backward(hyper.columns(relued.clone()), d_hyper.reborrow().columns(relued));
         let d_context = ViewMut::dense(fit(&mut state.d_context, agents * width), width);
         let context = View::dense(&state.context, width);
-        self.hyper
-            .backward(params, context, d_hyper.as_view(), Some(d_context), grads);
+        self.hyper.backward(params, context, d_hyper.as_view(), Some(d_context), grads);
 
         let d_context = View::dense(&state.d_context, width);
         for row in 0..d_representation.rows {
@@ -269,8 +231,7 @@ impl Mixer {
         let to = ViewMut::dense(d_encoded, width).columns(from..width);
         matmul::dy_w(d_out, self.out.weight(params), to, Accum::Replace);
         let d_encoded = View::dense(&state.d_encoded, width);
-        self.encoder
-            .backward(params, rows, &mut state.encoder, d_encoded, grads);
+        self.encoder.backward(params, rows, &mut state.encoder, d_encoded, grads);
     }
 }
 

@@ -75,8 +75,7 @@ pub enum ConfigError {
 impl RitConfig {
     /// h_z, 0 without task representations.
     pub fn representation_dim(&self) -> usize {
-        self.task_representations
-            .map_or(0, |representations| representations.dim)
+        self.task_representations.map_or(0, |representations| representations.dim)
     }
 
     /// Checks every size.
@@ -91,34 +90,18 @@ impl RitConfig {
             ("attention_dim", self.attention_dim),
             ("n_heads", self.n_heads),
         ];
-        if let Some(TaskRepresentations {
-            dim,
-            reward_embed_dim,
-        }) = self.task_representations
-        {
-            sizes.extend([
-                ("task_representation_dim", dim),
-                ("reward_embed_dim", reward_embed_dim),
-            ]);
+        if let Some(TaskRepresentations { dim, reward_embed_dim }) = self.task_representations {
+            sizes.extend([("task_representation_dim", dim), ("reward_embed_dim", reward_embed_dim)]);
         }
-        if let Mixing::Network {
-            mixing_embed_dim,
-            hypernet_embed_dim,
-        } = self.mixing
-        {
-            sizes.extend([
-                ("mixing_embed_dim", mixing_embed_dim),
-                ("hypernet_embed_dim", hypernet_embed_dim),
-            ]);
+        if let Mixing::Network { mixing_embed_dim, hypernet_embed_dim } = self.mixing {
+            sizes
+                .extend([("mixing_embed_dim", mixing_embed_dim), ("hypernet_embed_dim", hypernet_embed_dim)]);
         }
         if let Some((name, _)) = sizes.into_iter().find(|(_, size)| *size == 0) {
             return Err(ConfigError::Zero { name });
         }
         if !self.attention_dim.is_multiple_of(self.n_heads) {
-            return Err(ConfigError::Heads {
-                attention_dim: self.attention_dim,
-                n_heads: self.n_heads,
-            });
+            return Err(ConfigError::Heads { attention_dim: self.attention_dim, n_heads: self.n_heads });
         }
         Ok(())
     }
@@ -153,32 +136,19 @@ impl Rit {
         config.validate()?;
         let layout = &mut LayoutBuilder::default();
         let utility = Utility::new(layout, &config);
-        let task_encoder = config
-            .task_representations
-            .map(|sizes| TaskEncoder::new(layout, &config, sizes));
+        let task_encoder = config.task_representations.map(|sizes| TaskEncoder::new(layout, &config, sizes));
         let acting_len = layout.len();
         let mixer = match config.mixing {
-            Mixing::Network {
-                mixing_embed_dim,
-                hypernet_embed_dim,
-            } => Some(Mixer::new(layout, &config, mixing_embed_dim, hypernet_embed_dim)),
+            Mixing::Network { mixing_embed_dim, hypernet_embed_dim } => {
+                Some(Mixer::new(layout, &config, mixing_embed_dim, hypernet_embed_dim))
+            }
             Mixing::Sum => None,
         };
         let target_len = layout.len();
-        let discriminator = config
-            .task_representations
-            .map(|sizes| Discriminator::new(layout, sizes.dim, config.hidden_dim));
+        let discriminator =
+            config.task_representations.map(|sizes| Discriminator::new(layout, sizes.dim, config.hidden_dim));
         let layout = std::mem::take(layout).finish();
-        Ok(Self {
-            config,
-            layout,
-            utility,
-            task_encoder,
-            mixer,
-            discriminator,
-            acting_len,
-            target_len,
-        })
+        Ok(Self { config, layout, utility, task_encoder, mixer, discriminator, acting_len, target_len })
     }
 
     /// The parameters that acting needs: utility and task encoder.
@@ -204,33 +174,26 @@ impl Rit {
             task_encoder.forward(params, rows, before.task_encoder, &mut state.task_encoder);
         }
         let z = self.representation(&state.task_encoder);
-        self.utility
-            .forward(params, tables, rows, before.utility, z, &mut state.utility);
+        self.utility.forward(params, tables, rows, before.utility, z, &mut state.utility);
     }
 
     /// From prepared decisions to Q_total (groups) of these actions (agent rows), left in `state.q_total`.
     pub fn value(&self, params: &[f32], tables: &Tables, rows: &Rows, actions: &[u8], state: &mut Networks) {
         let decoder = &mut state.utility.decoder;
-        self.utility
-            .decoder
-            .forward(params, tables, rows, actions, decoder);
+        self.utility.decoder.forward(params, tables, rows, actions, decoder);
         state.chosen.clear();
         let utilities = decoder.utilities.chunks_exact(self.config.n_actions);
-        state.chosen.extend(
-            utilities
-                .zip(actions)
-                .map(|(utilities, &action)| utilities[usize::from(action)]),
-        );
+        state
+            .chosen
+            .extend(utilities.zip(actions).map(|(utilities, &action)| utilities[usize::from(action)]));
         state.q_total.clear();
         if let Some(mixer) = &self.mixer {
             let z = self.representation(&state.task_encoder);
             mixer.forward(params, rows, &state.chosen, z, &mut state.mixer);
             state.q_total.extend_from_slice(&state.mixer.q_total);
         } else {
-            let sums = rows
-                .groups
-                .iter()
-                .map(|group| state.chosen[group.queries.clone()].iter().sum::<f32>());
+            let sums =
+                rows.groups.iter().map(|group| state.chosen[group.queries.clone()].iter().sum::<f32>());
             state.q_total.extend(sums);
         }
     }
@@ -238,12 +201,7 @@ impl Rit {
     /// z (R, h_z); of no columns without task representations.
     pub fn representation<'a>(&self, state: &'a TaskEncoderState) -> View<'a> {
         match self.config.representation_dim() {
-            0 => View {
-                data: &[],
-                rows: 0,
-                cols: 0,
-                stride: 0,
-            },
+            0 => View { data: &[], rows: 0, cols: 0, stride: 0 },
             dim => View::dense(&state.representation, dim),
         }
     }

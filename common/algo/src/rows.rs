@@ -88,21 +88,10 @@ impl Rows {
         self.begin_time();
         for (index, turn) in turns.iter().enumerate() {
             let seen = turn.observation;
-            let step = Step {
-                episode: index,
-                time: 0,
-                reward: 0.0,
-                filled: false,
-                terminated: false,
-                task: 0,
-            };
+            let step =
+                Step { episode: index, time: 0, reward: 0.0, filled: false, terminated: false, task: 0 };
             self.push_group(seen.n_agents(), seen.n_entities(), step, turn.previous_reward);
-            self.push_state(
-                seen.n_agents(),
-                seen.n_entities(),
-                seen.entities(),
-                seen.observable(),
-            );
+            self.push_state(seen.n_agents(), seen.n_entities(), seen.entities(), seen.observable());
             self.available.extend_from_slice(seen.available());
             self.places.push(index);
         }
@@ -150,14 +139,9 @@ impl Rows {
                     self.group_times[time] + self.places[episode] < self.group_times[time + 1]
                 })
                 .map(move |time| self.group_of(episode, time));
-            groups
-                .filter(|&group| self.steps[group].filled)
-                .flat_map(move |group| {
-                    self.groups[group]
-                        .queries
-                        .clone()
-                        .map(move |row| (row, &self.steps[group]))
-                })
+            groups.filter(|&group| self.steps[group].filled).flat_map(move |group| {
+                self.groups[group].queries.clone().map(move |row| (row, &self.steps[group]))
+            })
         })
     }
 
@@ -184,31 +168,13 @@ impl Rows {
         let filled = time < steps;
         let terminated = time + 1 == steps && episode.end == rit_episode::End::Terminated;
         let reward = if filled { episode.rewards[time] } else { 0.0 };
-        let step = Step {
-            episode: index,
-            time,
-            reward,
-            filled,
-            terminated,
-            task: episode.task,
-        };
+        let step = Step { episode: index, time, reward, filled, terminated, task: episode.task };
         let d = episode.entities.len() / ((steps + 1) * m);
         let n_actions = episode.available.len() / ((steps + 1) * n);
         let part = |width: usize| time * width..(time + 1) * width;
-        self.push_group(
-            n,
-            m,
-            step,
-            if time == 0 { 0.0 } else { episode.rewards[time - 1] },
-        );
-        self.push_state(
-            n,
-            m,
-            &episode.entities[part(m * d)],
-            &episode.observable[part(n * m)],
-        );
-        self.available
-            .extend_from_slice(&episode.available[part(n * n_actions)]);
+        self.push_group(n, m, step, if time == 0 { 0.0 } else { episode.rewards[time - 1] });
+        self.push_state(n, m, &episode.entities[part(m * d)], &episode.observable[part(n * m)]);
+        self.available.extend_from_slice(&episode.available[part(n * n_actions)]);
         if filled {
             self.actions.extend_from_slice(&episode.actions[part(n)]);
         } else {
@@ -218,10 +184,7 @@ impl Rows {
 
     fn push_group(&mut self, n_agents: usize, n_entities: usize, step: Step, previous_reward: f32) {
         let (agents, entities) = (self.agent_rows(), self.entity_rows());
-        self.groups.push(Group {
-            queries: agents..agents + n_agents,
-            keys: entities..entities + n_entities,
-        });
+        self.groups.push(Group { queries: agents..agents + n_agents, keys: entities..entities + n_entities });
         self.steps.push(step);
         self.previous_rewards.push(previous_reward);
     }
@@ -272,11 +235,7 @@ mod tests {
         assert_eq!(rows.agent_times, [0, 3, 6, 8]);
         let whose: Vec<_> = rows.steps.iter().map(|step| (step.episode, step.time)).collect();
         assert_eq!(whose, [(1, 0), (0, 0), (1, 1), (0, 1), (1, 2)]);
-        let facts: Vec<_> = rows
-            .steps
-            .iter()
-            .map(|s| (s.filled, s.terminated, s.reward))
-            .collect();
+        let facts: Vec<_> = rows.steps.iter().map(|s| (s.filled, s.terminated, s.reward)).collect();
         let expected = [
             (true, false, 1.0),
             (true, false, 1.0),
@@ -289,15 +248,9 @@ mod tests {
         assert_eq!(rows.entities, entities.map(|x| x as f32));
         assert_eq!(rows.previous_rewards, [0.0, 0.0, 1.0, 1.0, 2.0]);
         assert_eq!(rows.others[..8], [0, 1, 1, 1, 0, 1, 0, 1]);
-        assert_eq!(
-            (rows.next_group(0), rows.next_group(1), rows.next_group(2)),
-            (2, 3, 4)
-        );
+        assert_eq!((rows.next_group(0), rows.next_group(1), rows.next_group(2)), (2, 3, 4));
         // The contrastive order is the batch's: short's one row, then long's four.
-        let ordered: Vec<_> = rows
-            .filled_agent_rows()
-            .map(|(row, step)| (row, step.task))
-            .collect();
+        let ordered: Vec<_> = rows.filled_agent_rows().map(|(row, step)| (row, step.task)).collect();
         assert_eq!(ordered, [(2, 1), (0, 2), (1, 2), (3, 2), (4, 2)]);
     }
 }

@@ -44,21 +44,13 @@ pub struct TaskEncoderState {
 impl TaskEncoder {
     /// Declares all parameters named `task_encoder.…`.
     pub fn new(layout: &mut LayoutBuilder, config: &RitConfig, representations: TaskRepresentations) -> Self {
-        let TaskRepresentations {
-            dim,
-            reward_embed_dim: r,
-        } = representations;
+        let TaskRepresentations { dim, reward_embed_dim: r } = representations;
         let (h, a) = (config.hidden_dim, config.attention_dim);
         let encoder = Encoder::new(layout, "task_encoder", config.entity_dim, h, a, config.n_heads);
         let reward_embed = Linear::new(layout, "task_encoder.reward_embed", 1, r);
         let gru = Gru::new(layout, "task_encoder.gru", h + a + r, h);
         let out = Linear::new(layout, "task_encoder.out", h, dim);
-        Self {
-            encoder,
-            reward_embed,
-            gru,
-            out,
-        }
+        Self { encoder, reward_embed, gru, out }
     }
 
     /// Columns of the GRU's input: ([x_k ‖ attention], reward).
@@ -78,13 +70,11 @@ impl TaskEncoder {
         let (h, r) = (self.gru.hidden_dim, self.reward_embed.outputs);
         let (encoded_columns, reward_columns) = self.columns();
         let weight = self.gru.input.weight(params);
-        self.encoder
-            .forward(params, rows, Visible::Where(&rows.others), &mut state.encoder);
+        self.encoder.forward(params, rows, Visible::Where(&rows.others), &mut state.encoder);
 
         let groups = rows.groups.len();
         let rewards = ViewMut::dense(fit(&mut state.rewards, groups * r), r);
-        self.reward_embed
-            .forward_relu(params, View::dense(&rows.previous_rewards, 1), rewards);
+        self.reward_embed.forward_relu(params, View::dense(&rows.previous_rewards, 1), rewards);
         let mut reward_gates = ViewMut::dense(fit(&mut state.reward_gates, groups * 3 * h), 3 * h);
         linear::fill_rows(reward_gates.reborrow(), self.gru.input.bias(params));
         let rewards = View::dense(&state.rewards, r);
@@ -97,19 +87,12 @@ impl TaskEncoder {
             }
         }
         let encoded = View::dense(&state.encoder.encoded, self.encoder.width());
-        matmul::x_wt(
-            encoded,
-            weight.columns(encoded_columns),
-            ViewMut::dense(gates, 3 * h),
-            Accum::Add,
-        );
-        self.gru
-            .forward(params, &rows.agent_times, before, &mut state.gru);
+        matmul::x_wt(encoded, weight.columns(encoded_columns), ViewMut::dense(gates, 3 * h), Accum::Add);
+        self.gru.forward(params, &rows.agent_times, before, &mut state.gru);
 
         let z = self.out.outputs;
         let representation = ViewMut::dense(fit(&mut state.representation, rows.agent_rows() * z), z);
-        self.out
-            .forward(params, View::dense(&state.gru.history, h), representation);
+        self.out.forward(params, View::dense(&state.gru.history, h), representation);
     }
 
     /// Takes `d_representation` (R, h_z) and adds to the parameters' gradients.
@@ -121,24 +104,13 @@ impl TaskEncoder {
         d_representation: View<'_>,
         grads: &mut [f32],
     ) {
-        let (h, r, width) = (
-            self.gru.hidden_dim,
-            self.reward_embed.outputs,
-            self.encoder.width(),
-        );
+        let (h, r, width) = (self.gru.hidden_dim, self.reward_embed.outputs, self.encoder.width());
         let (encoded_columns, reward_columns) = self.columns();
         let weight = self.gru.input.weight(params);
         let d_history = fit(&mut state.d_history, rows.agent_rows() * h);
         let history = View::dense(&state.gru.history, h);
-        self.out.backward(
-            params,
-            history,
-            d_representation,
-            Some(ViewMut::dense(d_history, h)),
-            grads,
-        );
-        self.gru
-            .backward(params, &rows.agent_times, &mut state.gru, d_history, grads);
+        self.out.backward(params, history, d_representation, Some(ViewMut::dense(d_history, h)), grads);
+        self.gru.backward(params, &rows.agent_times, &mut state.gru, d_history, grads);
         let d_gates = View::dense(&state.gru.gates, 3 * h);
 
         // Each group's agents share one reward: their gradients meet before the products.
@@ -156,30 +128,18 @@ impl TaskEncoder {
         let reward_weight = self.gru.input.weight_mut(grads).columns(reward_columns.clone());
         matmul::dyt_x(d_reward_gates, rewards, reward_weight);
         let mut d_rewards = ViewMut::dense(fit(&mut state.d_rewards, rows.groups.len() * r), r);
-        matmul::dy_w(
-            d_reward_gates,
-            weight.columns(reward_columns),
-            d_rewards.reborrow(),
-            Accum::Replace,
-        );
+        matmul::dy_w(d_reward_gates, weight.columns(reward_columns), d_rewards.reborrow(), Accum::Replace);
         activation::relu_backward(rewards, d_rewards.reborrow());
         let previous_rewards = View::dense(&rows.previous_rewards, 1);
-        self.reward_embed
-            .backward_params(previous_rewards, d_rewards.as_view(), grads);
+        self.reward_embed.backward_params(previous_rewards, d_rewards.as_view(), grads);
 
         let encoded = View::dense(&state.encoder.encoded, width);
         let encoded_weight = self.gru.input.weight_mut(grads).columns(encoded_columns.clone());
         matmul::dyt_x(d_gates, encoded, encoded_weight);
         let d_encoded = ViewMut::dense(fit(&mut state.d_encoded, rows.agent_rows() * width), width);
-        matmul::dy_w(
-            d_gates,
-            weight.columns(encoded_columns),
-            d_encoded,
-            Accum::Replace,
-        );
+        matmul::dy_w(d_gates, weight.columns(encoded_columns), d_encoded, Accum::Replace);
         let d_encoded = View::dense(&state.d_encoded, width);
-        self.encoder
-            .backward(params, rows, &mut state.encoder, d_encoded, grads);
+        self.encoder.backward(params, rows, &mut state.encoder, d_encoded, grads);
     }
 }
 

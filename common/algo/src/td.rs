@@ -2,11 +2,7 @@
 
 /// One filled step's target: r + γ (1 − terminated) Q̄_total(t + 1).
 pub fn target(reward: f32, gamma: f32, terminated: bool, next_target_q_total: f32) -> f32 {
-    if terminated {
-        reward
-    } else {
-        reward + gamma * next_target_q_total
-    }
+    if terminated { reward } else { reward + gamma * next_target_q_total }
 }
 
 /// (target − Q_total)² and its gradient by Q_total, divided by the number of filled steps.

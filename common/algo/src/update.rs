@@ -106,11 +106,7 @@ impl Update {
     /// # Panics
     /// When `params` is not of the layout's length.
     pub fn new(rit: Arc<Rit>, config: UpdateConfig, params: Vec<f32>) -> Result<Self, ThreadPoolBuildError> {
-        assert_eq!(
-            params.len(),
-            rit.layout.len(),
-            "parameters of the layout's length"
-        );
+        assert_eq!(params.len(), rit.layout.len(), "parameters of the layout's length");
         let pool = ThreadPoolBuilder::new()
             .num_threads(config.threads.max(1))
             .thread_name(|index| format!("update-{index}"))
@@ -154,21 +150,8 @@ impl Update {
     ) -> Losses {
         let filled: usize = batch.iter().map(|episode| episode.steps()).sum();
         let share = batch.len().div_ceil(self.shards.len()).max(1);
-        let Self {
-            rit,
-            config,
-            pool,
-            params,
-            target,
-            shards,
-            contrastive,
-            grads,
-            ..
-        } = self;
-        let tables = [
-            rit.utility.decoder.tables(params),
-            rit.utility.decoder.tables(target),
-        ];
+        let Self { rit, config, pool, params, target, shards, contrastive, grads, .. } = self;
+        let tables = [rit.utility.decoder.tables(params), rit.utility.decoder.tables(target)];
         let networks = [(&params[..], &tables[0]), (&target[..], &tables[1])];
         let parts = || batch.chunks(share).chain(std::iter::repeat(&[][..]));
         let work: Vec<_> = shards.iter_mut().zip(parts()).collect();
@@ -179,16 +162,11 @@ impl Update {
         });
         let contrastive_loss = pool.install(|| contrastive.loss(rit, params, shards, pairing));
         pool.install(|| {
-            shards
-                .par_iter_mut()
-                .for_each(|shard| shard.backward(rit, params, &tables[0]));
+            shards.par_iter_mut().for_each(|shard| shard.backward(rit, params, &tables[0]));
         });
 
         grads.fill(0.0);
-        let mut losses = Losses {
-            contrastive_loss,
-            ..Losses::default()
-        };
+        let mut losses = Losses { contrastive_loss, ..Losses::default() };
         let parts = contrastive.parts.iter().map(|(_, grads, _)| grads);
         for part in shards.iter().map(|shard| &shard.grads).chain(parts) {
             rit_nn::math::vectorized(|| rit_nn::math::add_scaled(grads, 1.0, part));
@@ -211,12 +189,7 @@ impl Update {
     /// implementations.
     pub fn inspect(&self, episodes: usize, episode: usize, time: usize) -> Inspection<'_> {
         let share = episodes.div_ceil(self.shards.len()).max(1);
-        Inspection {
-            rit: &self.rit,
-            shard: &self.shards[episode / share],
-            episode: episode % share,
-            time,
-        }
+        Inspection { rit: &self.rit, shard: &self.shards[episode / share], episode: episode % share, time }
     }
 }
 
@@ -235,9 +208,7 @@ impl Shard {
         rit.prepare(online, online_tables, rows, Before::default(), &mut self.online);
         self.greedy.resize(rows.agent_rows(), 0);
         let decoder = &mut self.online.utility.decoder;
-        rit.utility
-            .decoder
-            .greedy(online, online_tables, rows, decoder, &mut self.greedy);
+        rit.utility.decoder.greedy(online, online_tables, rows, decoder, &mut self.greedy);
         // The greedy pass's utilities make room for those of the actions taken, which backward needs.
         rit.value(online, online_tables, rows, &rows.actions, &mut self.online);
         rit.prepare(target, target_tables, rows, Before::default(), &mut self.target);
@@ -264,22 +235,12 @@ impl Shard {
         }
         // The contrastive loss adds to this before backward does.
         self.d_representation.clear();
-        self.d_representation
-            .resize(rows.agent_rows() * rit.config.representation_dim(), 0.0);
+        self.d_representation.resize(rows.agent_rows() * rit.config.representation_dim(), 0.0);
     }
 
     /// From the gradients by Q_total and by z to those of all parameters but the discriminator's.
     fn backward(&mut self, rit: &Rit, params: &[f32], tables: &Tables) {
-        let Self {
-            rows,
-            online,
-            d_total,
-            d_q,
-            d_utilities,
-            d_representation,
-            grads,
-            ..
-        } = self;
+        let Self { rows, online, d_total, d_q, d_utilities, d_representation, grads, .. } = self;
         grads.clear();
         grads.resize(params.len(), 0.0);
         if rows.groups.is_empty() {
@@ -289,16 +250,7 @@ impl Shard {
         d_q.resize(rows.agent_rows(), 0.0);
         if let Some(mixer) = &rit.mixer {
             let d_z = dense_mut(d_representation, z);
-            mixer.backward(
-                params,
-                rows,
-                &online.chosen,
-                &mut online.mixer,
-                d_total,
-                d_q,
-                d_z,
-                grads,
-            );
+            mixer.backward(params, rows, &online.chosen, &mut online.mixer, d_total, d_q, d_z, grads);
         } else {
             for (group, &d_total) in rows.groups.iter().zip(&*d_total) {
                 d_q[group.queries.clone()].fill(d_total);
@@ -342,12 +294,7 @@ impl Contrastive {
         let z = rit.config.representation_dim();
         self.rows.clear();
         for (index, shard) in shards.iter().enumerate() {
-            self.rows.extend(
-                shard
-                    .rows
-                    .filled_agent_rows()
-                    .map(|(row, step)| (index, row, step.task)),
-            );
+            self.rows.extend(shard.rows.filled_agent_rows().map(|(row, step)| (index, row, step.task)));
         }
         let rows = &self.rows;
         let count = rows.len();
@@ -373,22 +320,12 @@ impl Contrastive {
         let share = count.div_ceil(shards.len()).max(1);
         let pairs = View::dense(&self.pairs, 2 * z);
         let same = &self.same;
-        self.parts
-            .par_iter_mut()
-            .enumerate()
-            .for_each(|(part, (state, grads, loss))| {
-                let range = (part * share).min(count)..((part + 1) * share).min(count);
-                grads.clear();
-                grads.resize(params.len(), 0.0);
-                *loss = discriminator.loss(
-                    params,
-                    pairs.rows(range.clone()),
-                    &same[range],
-                    count,
-                    state,
-                    grads,
-                );
-            });
+        self.parts.par_iter_mut().enumerate().for_each(|(part, (state, grads, loss))| {
+            let range = (part * share).min(count)..((part + 1) * share).min(count);
+            grads.clear();
+            grads.resize(params.len(), 0.0);
+            *loss = discriminator.loss(params, pairs.rows(range.clone()), &same[range], count, state, grads);
+        });
 
         let d_pair = |i: usize| &self.parts[i / share].0.d_pairs[i % share * 2 * z..][..2 * z];
         for (i, &(shard, row, _)) in rows.iter().enumerate() {
@@ -435,10 +372,7 @@ impl<'a> Inspection<'a> {
 
     /// Q given the actions taken, `[n, A]`.
     pub fn utilities(&self) -> &'a [f32] {
-        self.agent_rows(
-            &self.shard.online.utility.decoder.utilities,
-            self.rit.config.n_actions,
-        )
+        self.agent_rows(&self.shard.online.utility.decoder.utilities, self.rit.config.n_actions)
     }
 
     /// The online network's greedy joint action, `[n]`.
@@ -465,12 +399,7 @@ impl<'a> Inspection<'a> {
 /// A dense matrix that may have no columns.
 fn dense_mut(data: &mut [f32], cols: usize) -> ViewMut<'_> {
     if cols == 0 {
-        ViewMut {
-            data: &mut [],
-            rows: 0,
-            cols: 0,
-            stride: 0,
-        }
+        ViewMut { data: &mut [], rows: 0, cols: 0, stride: 0 }
     } else {
         ViewMut::dense(data, cols)
     }

@@ -36,19 +36,12 @@ impl Utility {
         let gru = Gru::new(layout, "utility.gru", h + a, h);
         let z = config.representation_dim();
         let decoder = Decoder::new(layout, "utility", config.n_actions, h, a, config.n_heads, z);
-        Self {
-            encoder,
-            gru,
-            decoder,
-        }
+        Self { encoder, gru, decoder }
     }
 
     /// Histories τ of all rows, and all of the decoder that needs no predecessors. `before` (rows of the
     /// first time, h) is the history before the first time, or zeros; `representation` is z (R, h_z).
-    #[allow(
-        clippy::too_many_arguments,
-        reason = "a matrix and its companions, each named"
-    )]
+    #[allow(clippy::too_many_arguments, reason = "a matrix and its companions, each named")]
     pub fn forward(
         &self,
         params: &[f32],
@@ -59,25 +52,17 @@ impl Utility {
         state: &mut UtilityState,
     ) {
         let h = self.gru.hidden_dim;
-        self.encoder
-            .forward(params, rows, Visible::Where(&rows.others), &mut state.encoder);
+        self.encoder.forward(params, rows, Visible::Where(&rows.others), &mut state.encoder);
         let encoded = View::dense(&state.encoder.encoded, self.encoder.width());
         let gates = fit(&mut state.gru.gates, rows.agent_rows() * 3 * h);
-        self.gru
-            .input
-            .forward(params, encoded, ViewMut::dense(gates, 3 * h));
-        self.gru
-            .forward(params, &rows.agent_times, before, &mut state.gru);
+        self.gru.input.forward(params, encoded, ViewMut::dense(gates, 3 * h));
+        self.gru.forward(params, &rows.agent_times, before, &mut state.gru);
         let history = View::dense(&state.gru.history, h);
-        self.decoder
-            .prepare(params, tables, history, representation, &mut state.decoder);
+        self.decoder.prepare(params, tables, history, representation, &mut state.decoder);
     }
 
     /// Takes `d_utilities` (R, A); adds to `d_representation` (R, h_z) and to the parameters' gradients.
-    #[allow(
-        clippy::too_many_arguments,
-        reason = "a matrix and its companions, each named"
-    )]
+    #[allow(clippy::too_many_arguments, reason = "a matrix and its companions, each named")]
     pub fn backward(
         &self,
         params: &[f32],
@@ -103,21 +88,14 @@ impl Utility {
             d_representation,
             grads,
         );
-        self.gru
-            .backward(params, &rows.agent_times, &mut state.gru, d_history, grads);
+        self.gru.backward(params, &rows.agent_times, &mut state.gru, d_history, grads);
         let d_gates = View::dense(&state.gru.gates, 3 * h);
         let encoded = View::dense(&state.encoder.encoded, width);
         matmul::dyt_x(d_gates, encoded, self.gru.input.weight_mut(grads));
         let d_encoded = ViewMut::dense(fit(&mut state.d_encoded, rows.agent_rows() * width), width);
-        matmul::dy_w(
-            d_gates,
-            self.gru.input.weight(params),
-            d_encoded,
-            faer::Accum::Replace,
-        );
+        matmul::dy_w(d_gates, self.gru.input.weight(params), d_encoded, faer::Accum::Replace);
         let d_encoded = View::dense(&state.d_encoded, width);
-        self.encoder
-            .backward(params, rows, &mut state.encoder, d_encoded, grads);
+        self.encoder.backward(params, rows, &mut state.encoder, d_encoded, grads);
     }
 }
 

@@ -41,16 +41,8 @@ struct Sizes {
 #[derive(Deserialize)]
 #[serde(tag = "kind", rename_all = "lowercase")]
 enum OptimizerConfig {
-    RmsProp {
-        lr: f32,
-        eps: f32,
-        alpha: f32,
-    },
-    Adam {
-        lr: f32,
-        eps: f32,
-        betas: Option<[f32; 2]>,
-    },
+    RmsProp { lr: f32, eps: f32, alpha: f32 },
+    Adam { lr: f32, eps: f32, betas: Option<[f32; 2]> },
 }
 
 #[derive(Deserialize)]
@@ -63,10 +55,8 @@ struct Scalars {
 
 #[test]
 fn every_case_agrees_with_the_reference() {
-    let root = std::env::var_os("RIT_GOLDEN_DIR").map_or_else(
-        || Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden"),
-        PathBuf::from,
-    );
+    let root = std::env::var_os("RIT_GOLDEN_DIR")
+        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden"), PathBuf::from);
     let entries = fs::read_dir(&root).unwrap_or_else(|error| panic!("{}: {error}", root.display()));
     let mut folders: Vec<_> = entries.map(|entry| entry.unwrap().path()).collect();
     folders.retain(|folder| folder.join("case.json").is_file());
@@ -76,21 +66,14 @@ fn every_case_agrees_with_the_reference() {
     for folder in &folders {
         // However the batch is cut, the sums are the same within rounding.
         for shards in [1, 2, 3] {
-            let mut report = Report {
-                case: format!("{}, {shards} shards", folder.display()),
-                differences: vec![],
-            };
+            let mut report =
+                Report { case: format!("{}, {shards} shards", folder.display()), differences: vec![] };
             compare(folder, shards, &mut report);
             println!("{}: {} differences", report.case, report.differences.len());
             differences.extend(report.differences);
         }
     }
-    assert!(
-        differences.is_empty(),
-        "{} differences:\n{}",
-        differences.len(),
-        differences.join("\n")
-    );
+    assert!(differences.is_empty(), "{} differences:\n{}", differences.len(), differences.join("\n"));
 }
 
 fn compare(folder: &Path, shards: usize, report: &mut Report) {
@@ -134,9 +117,8 @@ fn compare(folder: &Path, shards: usize, report: &mut Report) {
     update.target = flat(&rit, &read("target_weights"), rit.target());
 
     let cells = Cells::read(&batch, sizes);
-    let episodes: Vec<Episode> = (0..cells.episodes())
-        .map(|index| cells.episode(&batch, sizes, index))
-        .collect();
+    let episodes: Vec<Episode> =
+        (0..cells.episodes()).map(|index| cells.episode(&batch, sizes, index)).collect();
     let pairing: Vec<usize> = batch.i32("pairing").iter().map(|&row| row as usize).collect();
     let losses = update.gradients(&episodes.iter().collect::<Vec<_>>(), |rows| {
         assert_eq!(rows, pairing.len(), "one pair for each filled agent row");
@@ -147,11 +129,7 @@ fn compare(folder: &Path, shards: usize, report: &mut Report) {
     compare_networks(&update, &cells, sizes, &expected, report);
     for param in rit.layout.params() {
         let name = format!("gradient of {}", param.name);
-        report.gradients(
-            &name,
-            &update.grads()[param.range.clone()],
-            &gradients.f32(&param.name),
-        );
+        report.gradients(&name, &update.grads()[param.range.clone()], &gradients.f32(&param.name));
     }
 
     // The optimiser, fed with the stored gradients.
@@ -169,11 +147,7 @@ fn compare(folder: &Path, shards: usize, report: &mut Report) {
 fn compare_losses(losses: &Losses, scalars: &Scalars, report: &mut Report) {
     let pairs = [
         ("td_loss", losses.td_loss, scalars.td_loss),
-        (
-            "contrastive_loss",
-            losses.contrastive_loss,
-            scalars.contrastive_loss,
-        ),
+        ("contrastive_loss", losses.contrastive_loss, scalars.contrastive_loss),
         ("loss", losses.td_loss + losses.contrastive_loss, scalars.loss),
         ("grad_norm", losses.grad_norm, scalars.grad_norm),
     ];
@@ -215,11 +189,7 @@ fn compare_networks(update: &Update, cells: &Cells, sizes: &Sizes, expected: &Te
                 tensors[6].1.push(f32::from(next.greedy_actions()[k]));
                 tensors[6].2.push(greedy[cell * sizes.agents_max + row] as f32);
             }
-            for (tensor, ours) in [
-                (3, now.q_total()),
-                (4, next.target_q_total()),
-                (5, now.td_target()),
-            ] {
+            for (tensor, ours) in [(3, now.q_total()), (4, next.target_q_total()), (5, now.td_target())] {
                 tensors[tensor].1.push(ours);
                 let theirs = expected.f32(tensors[tensor].0)[cell];
                 tensors[tensor].2.push(theirs);
@@ -248,10 +218,7 @@ impl Cells {
         let steps_max = filled.len() / episodes;
         let steps = filled.chunks(steps_max).map(|filled| {
             let steps = filled.iter().filter(|&&filled| filled == 1.0).count();
-            assert!(
-                filled[..steps].iter().all(|&filled| filled == 1.0),
-                "filled steps come first"
-            );
+            assert!(filled[..steps].iter().all(|&filled| filled == 1.0), "filled steps come first");
             steps
         });
         let real = |present: &[f32], rows: usize| (0..rows).filter(|&row| present[row] == 1.0).collect();
@@ -260,9 +227,7 @@ impl Cells {
             steps_max,
             steps: steps.collect(),
             agents: present().map(|present| real(present, sizes.agents_max)).collect(),
-            entities: present()
-                .map(|present| real(present, sizes.entities_max))
-                .collect(),
+            entities: present().map(|present| real(present, sizes.entities_max)).collect(),
         }
     }
 
@@ -276,16 +241,10 @@ impl Cells {
         let (n_max, m_max) = (sizes.agents_max, sizes.entities_max);
         let (agents, others, steps) = (&self.agents[index], &self.entities[index], self.steps[index]);
         let state = |time: usize| index * (self.steps_max + 1) + time;
-        let (entities, observable, available) = (
-            batch.f32("entities"),
-            batch.f32("observable"),
-            batch.f32("available"),
-        );
-        let (actions, rewards, terminated) = (
-            batch.i32("actions"),
-            batch.f32("rewards"),
-            batch.f32("terminated"),
-        );
+        let (entities, observable, available) =
+            (batch.f32("entities"), batch.f32("observable"), batch.f32("available"));
+        let (actions, rewards, terminated) =
+            (batch.i32("actions"), batch.f32("rewards"), batch.f32("terminated"));
         let mut episode = Episode {
             number: index as u64,
             weights_version: 0,
@@ -307,23 +266,17 @@ impl Cells {
         };
         for time in 0..=steps {
             for &row in others {
-                episode
-                    .entities
-                    .extend_from_slice(&entities[(state(time) * m_max + row) * d..][..d]);
+                episode.entities.extend_from_slice(&entities[(state(time) * m_max + row) * d..][..d]);
             }
             for &agent in agents {
                 let row = &observable[(state(time) * n_max + agent) * m_max..][..m_max];
-                episode
-                    .observable
-                    .extend(others.iter().map(|&entity| row[entity] as u8));
+                episode.observable.extend(others.iter().map(|&entity| row[entity] as u8));
                 let row = &available[(state(time) * n_max + agent) * a..][..a];
                 episode.available.extend(row.iter().map(|&flag| flag as u8));
             }
             if time < steps {
                 let row = &actions[(index * self.steps_max + time) * n_max..][..n_max];
-                episode
-                    .actions
-                    .extend(agents.iter().map(|&agent| row[agent] as u8));
+                episode.actions.extend(agents.iter().map(|&agent| row[agent] as u8));
             }
         }
         episode
@@ -333,12 +286,7 @@ impl Cells {
 /// Parameters by name, in the layout's order.
 fn flat(rit: &Rit, tensors: &Tensors, range: std::ops::Range<usize>) -> Vec<f32> {
     let mut flat = Vec::new();
-    for param in rit
-        .layout
-        .params()
-        .iter()
-        .filter(|param| param.range.end <= range.end)
-    {
+    for param in rit.layout.params().iter().filter(|param| param.range.end <= range.end) {
         let values = tensors.f32(&param.name);
         assert_eq!(values.len(), param.range.len(), "{}", param.name);
         flat.extend(values);
@@ -352,9 +300,7 @@ struct Tensors(Vec<u8>);
 impl Tensors {
     fn words(&self, name: &str) -> Vec<[u8; 4]> {
         let tensors = SafeTensors::deserialize(&self.0).unwrap();
-        let tensor = tensors
-            .tensor(name)
-            .unwrap_or_else(|error| panic!("{name}: {error}"));
+        let tensor = tensors.tensor(name).unwrap_or_else(|error| panic!("{name}: {error}"));
         tensor.data().as_chunks::<4>().0.to_vec()
     }
 
@@ -391,9 +337,8 @@ impl Report {
         let differs = |(_, (a, b)): &(usize, (&f32, &f32))| !matches!((*a - *b).abs().partial_cmp(&tolerance), Some(order) if order.is_le());
         if let Some((at, (a, b))) = ours.iter().zip(theirs).enumerate().find(differs) {
             let case = &self.case;
-            self.differences.push(format!(
-                "{case}: {name}[{at}] is {a}, reference {b}, tolerance {tolerance}"
-            ));
+            self.differences
+                .push(format!("{case}: {name}[{at}] is {a}, reference {b}, tolerance {tolerance}"));
         }
     }
 }

@@ -19,15 +19,10 @@ fn config(n_heads: usize, task_representations: bool, mixing_network: bool) -> R
         hidden_dim: 6,
         attention_dim: 4,
         n_heads,
-        task_representations: task_representations.then_some(TaskRepresentations {
-            dim: 3,
-            reward_embed_dim: 2,
-        }),
+        task_representations: task_representations
+            .then_some(TaskRepresentations { dim: 3, reward_embed_dim: 2 }),
         mixing: if mixing_network {
-            Mixing::Network {
-                mixing_embed_dim: 4,
-                hypernet_embed_dim: 5,
-            }
+            Mixing::Network { mixing_embed_dim: 4, hypernet_embed_dim: 5 }
         } else {
             Mixing::Sum
         },
@@ -48,12 +43,8 @@ fn episode(task: usize, n: usize, m: usize, steps: usize, end: End, rng: &mut Rn
         n_agents: n,
         n_entities: m,
         decision_order: decision_order::identity(n),
-        entities: (0..(steps + 1) * m * D)
-            .map(|_| rng.random_range(-1.0..1.0))
-            .collect(),
-        observable: (0..(steps + 1) * n * m)
-            .map(|_| u8::from(rng.random_range(0..3) > 0))
-            .collect(),
+        entities: (0..(steps + 1) * m * D).map(|_| rng.random_range(-1.0..1.0)).collect(),
+        observable: (0..(steps + 1) * n * m).map(|_| u8::from(rng.random_range(0..3) > 0)).collect(),
         available,
         actions,
         rewards: (0..steps).map(|_| rng.random_range(-1.0..1.0)).collect(),
@@ -75,39 +66,21 @@ fn batch(seed: u64) -> Vec<Episode> {
 }
 
 fn update(rit: &Arc<Rit>, shards: usize, threads: usize, params: Vec<f32>) -> Update {
-    let optimizer = OptimizerKind::Adam {
-        beta1: 0.9,
-        beta2: 0.999,
-        eps: 1e-8,
-    };
-    let config = UpdateConfig {
-        gamma: 0.9,
-        lr: 1e-2,
-        optimizer,
-        grad_norm_clip: 10.0,
-        shards,
-        threads,
-    };
+    let optimizer = OptimizerKind::Adam { beta1: 0.9, beta2: 0.999, eps: 1e-8 };
+    let config = UpdateConfig { gamma: 0.9, lr: 1e-2, optimizer, grad_norm_clip: 10.0, shards, threads };
     Update::new(Arc::clone(rit), config, params).unwrap()
 }
 
 /// Parameters large enough that no gradient hides in rounding.
 fn params(rit: &Rit, seed: u64) -> Vec<f32> {
-    gradcheck::noise(seed, rit.layout.len())
-        .iter()
-        .map(|x| 0.7 * x)
-        .collect()
+    gradcheck::noise(seed, rit.layout.len()).iter().map(|x| 0.7 * x).collect()
 }
 
 #[test]
 fn every_parameters_gradient_is_the_numeric_one() {
-    for (heads, representations, network) in [
-        (1, true, true),
-        (2, true, true),
-        (2, false, true),
-        (2, true, false),
-        (1, false, false),
-    ] {
+    for (heads, representations, network) in
+        [(1, true, true), (2, true, true), (2, false, true), (2, true, false), (1, false, false)]
+    {
         let rit = Arc::new(Rit::new(config(heads, representations, network)).unwrap());
         let episodes = batch(7);
         let batch: Vec<&Episode> = episodes.iter().collect();
@@ -123,9 +96,7 @@ fn every_parameters_gradient_is_the_numeric_one() {
             let range = param.range.clone();
             if param.name.ends_with("attention.key.bias") {
                 // Softmax does not see what is added to every score: the true gradient is zero.
-                let largest = grads[range]
-                    .iter()
-                    .fold(0.0_f32, |largest, g| largest.max(g.abs()));
+                let largest = grads[range].iter().fold(0.0_f32, |largest, g| largest.max(g.abs()));
                 assert!(largest < 1e-5, "{}: {largest}", param.name);
                 continue;
             }
@@ -149,11 +120,7 @@ fn replay(acting: &mut Acting, slots: &[(usize, &Episode)]) -> Vec<Vec<f32>> {
     for &(slot, episode) in slots {
         acting.begin(slot, episode.n_agents);
     }
-    let longest = slots
-        .iter()
-        .map(|(_, episode)| episode.steps())
-        .max()
-        .unwrap_or(0);
+    let longest = slots.iter().map(|(_, episode)| episode.steps()).max().unwrap_or(0);
     for time in 0..longest {
         let running: Vec<usize> = (0..slots.len()).filter(|&i| time < slots[i].1.steps()).collect();
         let mut seen: Vec<(Observation, Vec<u8>, Rng)> = running
@@ -169,9 +136,7 @@ fn replay(acting: &mut Acting, slots: &[(usize, &Episode)]) -> Vec<Vec<f32>> {
                 }
                 for agent in 0..n {
                     let row = time * n + agent;
-                    observation
-                        .observable_mut(agent)
-                        .copy_from_slice(&episode.observable[row * m..][..m]);
+                    observation.observable_mut(agent).copy_from_slice(&episode.observable[row * m..][..m]);
                     observation.available_mut(agent)[usize::from(episode.actions[row])] = 1;
                 }
                 (observation, vec![0; n], RunSeed(0).stream(Stream::Exploration, 0))
@@ -183,11 +148,7 @@ fn replay(acting: &mut Acting, slots: &[(usize, &Episode)]) -> Vec<Vec<f32>> {
             .map(|((observation, actions, exploration), &i)| Turn {
                 slot: slots[i].0,
                 observation,
-                previous_reward: if time == 0 {
-                    0.0
-                } else {
-                    slots[i].1.rewards[time - 1]
-                },
+                previous_reward: if time == 0 { 0.0 } else { slots[i].1.rewards[time - 1] },
                 epsilon: 0.0,
                 exploration,
                 actions,
@@ -220,10 +181,7 @@ fn acting_row_by_row_equals_the_masked_parallel_pass() {
                 let trained = update.inspect(batch.len(), *index, time).utilities();
                 let acted = &acted[time * episode.n_agents * A..][..episode.n_agents * A];
                 for (a, b) in acted.iter().zip(trained) {
-                    assert!(
-                        (a - b).abs() <= 1e-5 * b.abs().max(1.0),
-                        "episode {index} step {time}: {a} {b}"
-                    );
+                    assert!((a - b).abs() <= 1e-5 * b.abs().max(1.0), "episode {index} step {time}: {a} {b}");
                 }
             }
         }
@@ -238,10 +196,7 @@ fn acting_does_not_depend_on_company() {
     let together: Vec<_> = episodes.iter().enumerate().collect();
     let all = replay(&mut Acting::new(Arc::clone(&rit), &at[rit.acting()]), &together);
     for (index, episode) in episodes.iter().enumerate() {
-        let alone = replay(
-            &mut Acting::new(Arc::clone(&rit), &at[rit.acting()]),
-            &[(3, episode)],
-        );
+        let alone = replay(&mut Acting::new(Arc::clone(&rit), &at[rit.acting()]), &[(3, episode)]);
         assert_eq!(alone[0], all[index], "episode {index}, bit for bit");
     }
 }

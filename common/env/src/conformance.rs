@@ -9,7 +9,8 @@ const EPISODES: u64 = 40;
 
 /// Rolls episodes of random available actions and checks what every environment promises: constant sizes,
 /// finite features and rewards, flags that are 0 or 1, an available action for everyone, agents that see
-/// themselves or nothing, an end within the limit, and the same course from the same stream.
+/// themselves or nothing, a scene of every entity or none, an end within the limit, and the same course from
+/// the same stream.
 ///
 /// # Panics
 /// With the promise that was broken.
@@ -19,18 +20,10 @@ pub fn check(make: impl Fn() -> Box<dyn Environment>) {
         let once = roll(environment.as_mut(), episode);
         let again = roll(environment.as_mut(), episode);
         assert!(once == again, "reset forgets the episode before");
-        assert!(
-            once == roll(make().as_mut(), episode),
-            "the same stream gives the same course"
-        );
+        assert!(once == roll(make().as_mut(), episode), "the same stream gives the same course");
     }
-    let courses: Vec<_> = (0..EPISODES)
-        .map(|episode| roll(environment.as_mut(), episode))
-        .collect();
-    assert!(
-        courses.iter().any(|course| course != &courses[0]),
-        "actions or randomness change the course"
-    );
+    let courses: Vec<_> = (0..EPISODES).map(|episode| roll(environment.as_mut(), episode)).collect();
+    assert!(courses.iter().any(|course| course != &courses[0]), "actions or randomness change the course");
 }
 
 /// One episode's course: every observation and every step.
@@ -39,19 +32,11 @@ fn roll(environment: &mut dyn Environment, episode: u64) -> Vec<(Observation, Op
     let rng = &mut seed.stream(Stream::Environment, episode);
     let exploration = &mut seed.stream(Stream::Exploration, episode);
     let sizes = |environment: &dyn Environment| {
-        (
-            environment.n_agents(),
-            environment.n_entities(),
-            environment.feature_dim(),
-            environment.n_actions(),
-        )
+        (environment.n_agents(), environment.n_entities(), environment.feature_dim(), environment.n_actions())
     };
     let constant = sizes(environment);
     let (n, m, features, n_actions) = constant;
-    assert!(
-        n >= 1 && m >= n && features >= 1 && n_actions >= 1,
-        "there is something to decide"
-    );
+    assert!(n >= 1 && m >= n && features >= 1 && n_actions >= 1, "there is something to decide");
 
     environment.reset(rng);
     let mut course: Vec<(Observation, Option<Step>)> = Vec::new();
@@ -60,21 +45,17 @@ fn roll(environment: &mut dyn Environment, episode: u64) -> Vec<(Observation, Op
         environment.observe(&mut observation);
         check_observation(&observation);
         assert_eq!(sizes(environment), constant, "sizes are constant");
-        if course
-            .last()
-            .and_then(|(_, step)| *step)
-            .is_some_and(|step| step.end.is_some())
-        {
+        assert!(
+            environment.scene().is_none_or(|scene| scene.bodies.len() == m),
+            "a scene shows every entity"
+        );
+        if course.last().and_then(|(_, step)| *step).is_some_and(|step| step.end.is_some()) {
             course.push((observation, None));
             return course;
         }
-        assert!(
-            course.len() < environment.steps_max(),
-            "an episode ends within its limit"
-        );
-        let actions: Vec<Action> = (0..n)
-            .map(|agent| any_available(&observation, agent, exploration))
-            .collect();
+        assert!(course.len() < environment.steps_max(), "an episode ends within its limit");
+        let actions: Vec<Action> =
+            (0..n).map(|agent| any_available(&observation, agent, exploration)).collect();
         let step = environment.step(&actions, rng);
         assert!(step.reward.is_finite(), "rewards are finite");
         course.push((observation, Some(step)));
@@ -83,22 +64,13 @@ fn roll(environment: &mut dyn Environment, episode: u64) -> Vec<(Observation, Op
 
 fn check_observation(observation: &Observation) {
     let m = observation.n_entities();
-    assert!(
-        observation.entities().iter().all(|feature| feature.is_finite()),
-        "features are finite"
-    );
+    assert!(observation.entities().iter().all(|feature| feature.is_finite()), "features are finite");
     let flags = observation.observable().iter().chain(observation.available());
     assert!(flags.into_iter().all(|&flag| flag <= 1), "flags are 0 or 1");
     for agent in 0..observation.n_agents() {
         let seen = &observation.observable()[agent * m..][..m];
-        assert!(
-            seen[agent] == 1 || seen.iter().all(|&flag| flag == 0),
-            "an agent sees itself, or nothing"
-        );
-        assert!(
-            observation.available_to(agent).contains(&1),
-            "everyone has something to do"
-        );
+        assert!(seen[agent] == 1 || seen.iter().all(|&flag| flag == 0), "an agent sees itself, or nothing");
+        assert!(observation.available_to(agent).contains(&1), "everyone has something to do");
     }
 }
 

@@ -1,6 +1,7 @@
 //! What one task's world does.
 
 use rit_episode::{Action, End, Observation, Rng};
+use serde::{Deserialize, Serialize};
 
 /// What one joint action led to.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -11,6 +12,45 @@ pub struct Step {
     pub end: Option<End>,
     /// Whether the team has won; only meaningful where the task knows winning.
     pub won: bool,
+}
+
+/// How the environments of a run differ from what their task says. The default changes nothing.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct EnvironmentOptions {
+    /// How far an agent sees in a particle world, from centre to centre; everything where `None`.
+    pub view_radius: Option<f32>,
+}
+
+/// What a body is to the agents.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum BodyKind {
+    /// An agent; a predator.
+    Agent,
+    /// A landmark; an obstacle.
+    Landmark,
+    /// A prey.
+    Prey,
+}
+
+/// One body of a [`Scene`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SceneBody {
+    /// What it is.
+    pub kind: BodyKind,
+    /// Place of its centre.
+    pub x: f32,
+    /// Place of its centre.
+    pub y: f32,
+    /// Its size.
+    pub radius: f32,
+}
+
+/// What can be drawn of a state: every entity, in the environment's order.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Scene {
+    /// The entities.
+    pub bodies: Vec<SceneBody>,
 }
 
 /// One task's world: real agents and entities only, agents in an order of its own.
@@ -42,4 +82,9 @@ pub trait Environment: Send {
 
     /// Takes one joint action, `[n_agents]`, each available.
     fn step(&mut self, actions: &[Action], rng: &mut Rng) -> Step;
+
+    /// What can be drawn of the state, where the entities have places.
+    fn scene(&self) -> Option<Scene> {
+        None
+    }
 }

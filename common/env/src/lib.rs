@@ -9,10 +9,13 @@
 pub mod conformance;
 mod environment;
 pub mod matrix_game;
+pub mod particle;
 pub mod rollout;
 mod seated;
 mod task_set;
+mod unknown_name;
 
-pub use environment::{Environment, Step};
+pub use environment::{BodyKind, Environment, EnvironmentOptions, Scene, SceneBody, Step};
 pub use seated::Seated;
-pub use task_set::{Split, Task, TaskSet, UnknownName};
+pub use task_set::{Split, Task, TaskSet};
+pub use unknown_name::UnknownName;

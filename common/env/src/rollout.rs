@@ -1,6 +1,6 @@
 //! The rollout loop: numbered episodes in, finished episodes out. Actors and evaluation share it.
 
-use crate::{Seated, Task};
+use crate::{EnvironmentOptions, Seated, Task};
 use rand::RngExt as _;
 use rit_episode::{
     Action, End, Episode, EpisodeBuilder, Observation, Policy, Rng, RunSeed, Stream, Turn, decision_order,
@@ -23,6 +23,7 @@ pub struct Job {
 /// and the policy alone, not on the jobs beside it.
 pub struct Rollout {
     tasks: Vec<Task>,
+    options: EnvironmentOptions,
     seed: RunSeed,
     random_permutation: bool,
     /// Worlds that wait for their next episode, by task.
@@ -44,30 +45,27 @@ struct Running {
 }
 
 impl Rollout {
-    /// Rolls episodes of these tasks with streams of this seed; with `random_permutation` each episode's
+    /// Rolls episodes of these tasks, played with these options, with streams of this seed; with `random_permutation` each episode's
     /// decision order is a fresh uniform permutation.
     ///
     /// # Panics
     /// Without tasks.
-    pub fn new(tasks: Vec<Task>, seed: RunSeed, random_permutation: bool) -> Self {
+    pub fn new(
+        tasks: Vec<Task>,
+        options: EnvironmentOptions,
+        seed: RunSeed,
+        random_permutation: bool,
+    ) -> Self {
         assert!(!tasks.is_empty(), "a rollout needs a task");
         let idle = tasks.iter().map(|_| Vec::new()).collect();
-        Self {
-            tasks,
-            seed,
-            random_permutation,
-            idle,
-        }
+        Self { tasks, options, seed, random_permutation, idle }
     }
 
     /// Rolls all jobs side by side to their ends and returns their episodes in the jobs' order.
     pub fn roll(&mut self, policy: &mut dyn Policy, jobs: &[Job]) -> Vec<Episode> {
         let mut episodes: Vec<Option<Episode>> = jobs.iter().map(|_| None).collect();
-        let mut running: Vec<Running> = jobs
-            .iter()
-            .enumerate()
-            .map(|(slot, job)| self.begin(policy, slot, job))
-            .collect();
+        let mut running: Vec<Running> =
+            jobs.iter().enumerate().map(|(slot, job)| self.begin(policy, slot, job)).collect();
         while !running.is_empty() {
             let mut turns: Vec<Turn<'_>> = running.iter_mut().map(Running::turn).collect();
             policy.act(&mut turns);
@@ -89,12 +87,9 @@ impl Rollout {
 
     fn begin(&mut self, policy: &mut dyn Policy, slot: usize, job: &Job) -> Running {
         let stream = |name| self.seed.stream(name, job.number);
-        let task = job
-            .task
-            .unwrap_or_else(|| stream(Stream::Task).random_range(0..self.tasks.len()));
-        let mut world = self.idle[task]
-            .pop()
-            .unwrap_or_else(|| Seated::new(self.tasks[task].environment()));
+        let task = job.task.unwrap_or_else(|| stream(Stream::Task).random_range(0..self.tasks.len()));
+        let mut world =
+            self.idle[task].pop().unwrap_or_else(|| Seated::new(self.tasks[task].environment(self.options)));
         let n_agents = world.environment().n_agents();
         let order = if self.random_permutation {
             decision_order::draw(n_agents, &mut stream(Stream::DecisionOrder))
@@ -165,20 +160,14 @@ mod tests {
     fn rollout(seed: u64, random_permutation: bool) -> Rollout {
         Rollout::new(
             TaskSet::MatrixGame.tasks(Split::Training),
+            EnvironmentOptions::default(),
             RunSeed(seed),
             random_permutation,
         )
     }
 
     fn jobs(numbers: std::ops::Range<u64>) -> Vec<Job> {
-        numbers
-            .map(|number| Job {
-                number,
-                weights_version: 0,
-                epsilon: 0.0,
-                task: None,
-            })
-            .collect()
+        numbers.map(|number| Job { number, weights_version: 0, epsilon: 0.0, task: None }).collect()
     }
 
     #[test]
@@ -197,12 +186,8 @@ mod tests {
     fn actions_are_mapped_back_through_the_decision_order() {
         // Game 1 is won by (a¹, a³) of the environment's agents. Rows play (a¹, a³), so it is won exactly
         // when agent 0 decides first; game 4 is won by (a¹, a¹), whoever is first.
-        let jobs: Vec<Job> = (0..40)
-            .map(|number| Job {
-                task: Some(0),
-                ..jobs(number..number + 1)[0]
-            })
-            .collect();
+        let jobs: Vec<Job> =
+            (0..40).map(|number| Job { task: Some(0), ..jobs(number..number + 1)[0] }).collect();
         let episodes = rollout(5, true).roll(&mut Fixed([0, 2]), &jobs);
         for episode in &episodes {
             assert!(is_permutation(&episode.decision_order));
@@ -217,10 +202,22 @@ mod tests {
         }
         assert!(episodes.iter().any(|episode| episode.won) && episodes.iter().any(|episode| !episode.won));
         let unpermuted = rollout(5, false).roll(&mut Fixed([0, 2]), &jobs);
-        assert!(
-            unpermuted
-                .iter()
-                .all(|episode| episode.won && episode.end == End::Terminated)
-        );
+        assert!(unpermuted.iter().all(|episode| episode.won && episode.end == End::Terminated));
+    }
+
+    #[test]
+    fn options_reach_the_environments() {
+        for (view_radius, sees_others) in [(None, true), (Some(0.0), false)] {
+            let tasks = TaskSet::CooperativeNavigation.tasks(Split::Training);
+            let options = EnvironmentOptions { view_radius };
+            let episodes = Rollout::new(tasks, options, RunSeed(1), true)
+                .roll(&mut Fixed([0, 0]), &[Job { task: Some(0), ..jobs(0..1)[0] }]);
+            let rows = episodes[0].observable.chunks_exact(4).enumerate();
+            for (row, seen) in rows {
+                let itself_only = [[1, 0, 0, 0], [0, 1, 0, 0]][row % 2];
+                assert_eq!(seen, if sees_others { [1; 4] } else { itself_only });
+            }
+            assert_eq!(episodes[0].steps(), 25);
+        }
     }
 }

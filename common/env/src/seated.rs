@@ -19,12 +19,7 @@ impl Seated {
     /// Takes an environment; [`Seated::reset`] comes before anything else.
     pub fn new(environment: Box<dyn Environment>) -> Self {
         let decision_order = decision_order::identity(environment.n_agents());
-        Self {
-            environment,
-            decision_order,
-            inner: Observation::default(),
-            last_actions: None,
-        }
+        Self { environment, decision_order, inner: Observation::default(), last_actions: None }
     }
 
     /// Features of one entity, its last action included: d.
@@ -42,15 +37,8 @@ impl Seated {
     /// # Panics
     /// When the order is not a permutation of the environment's agents.
     pub fn reset(&mut self, order: Vec<u8>, rng: &mut Rng) {
-        assert_eq!(
-            order.len(),
-            self.environment.n_agents(),
-            "one place for each agent"
-        );
-        assert!(
-            decision_order::is_permutation(&order),
-            "a decision order is a permutation"
-        );
+        assert_eq!(order.len(), self.environment.n_agents(), "one place for each agent");
+        assert!(decision_order::is_permutation(&order), "a decision order is a permutation");
         self.decision_order = order;
         self.last_actions = None;
         self.environment.reset(rng);
@@ -78,9 +66,7 @@ impl Seated {
                 let entity = self.entity_at(column);
                 observation.observable_mut(row)[column] = self.inner.observable()[agent * m + entity];
             }
-            observation
-                .available_mut(row)
-                .copy_from_slice(self.inner.available_to(agent));
+            observation.available_mut(row).copy_from_slice(self.inner.available_to(agent));
         }
     }
 
@@ -96,8 +82,6 @@ impl Seated {
 
     /// The environment's entity that sits in this row.
     fn entity_at(&self, row: usize) -> usize {
-        self.decision_order
-            .get(row)
-            .map_or(row, |&agent| usize::from(agent))
+        self.decision_order.get(row).map_or(row, |&agent| usize::from(agent))
     }
 }

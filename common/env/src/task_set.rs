@@ -1,9 +1,17 @@
 //! Which tasks belong together: training tasks to learn from, testing tasks for zero-shot evaluation.
 
-use crate::{Environment, matrix_game::MatrixGame};
+use crate::{
+    Environment, EnvironmentOptions, UnknownName,
+    matrix_game::MatrixGame,
+    particle::{CooperativeNavigation, PredatorPrey, PredatorPreyReward},
+};
 use rit_episode::{Dims, wire::TaskSize};
 use serde::{Deserialize, Serialize};
 use std::{fmt, str::FromStr};
+
+/// (predators, prey) of the predator and prey tasks, plain and pro.
+const TRAINING_HUNTS: [(usize, usize); 3] = [(2, 1), (3, 1), (3, 2)];
+const TESTING_HUNTS: [(usize, usize); 2] = [(4, 2), (5, 2)];
 
 /// The task sets of the paper's section VI.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -11,6 +19,12 @@ use std::{fmt, str::FromStr};
 pub enum TaskSet {
     /// Four two-step matrix games (table I).
     MatrixGame,
+    /// The cooperative navigation series.
+    CooperativeNavigation,
+    /// The predator and prey series.
+    PredatorPrey,
+    /// The predator and prey series pro.
+    PredatorPreyPro,
 }
 
 /// Tasks are trained on or kept for zero-shot evaluation.
@@ -30,83 +44,97 @@ pub enum Task {
         /// Which.
         game: usize,
     },
-}
-
-/// A name that means nothing, with those that do.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("unknown {what} {name:?}; known: {}", known.join(", "))]
-pub struct UnknownName {
-    /// What was asked for.
-    pub what: &'static str,
-    /// The name given.
-    pub name: String,
-    /// Names that would do.
-    pub known: Vec<String>,
+    /// Cooperative navigation (n, n).
+    CooperativeNavigation {
+        /// Number of agents, and of landmarks.
+        n: usize,
+    },
+    /// Predator and prey (m, n).
+    PredatorPrey {
+        /// Number of predators, m: the agents.
+        predators: usize,
+        /// Number of prey, n.
+        prey: usize,
+        /// Which series it belongs to.
+        reward: PredatorPreyReward,
+    },
 }
 
 impl TaskSet {
     /// Every task set.
-    pub const ALL: [Self; 1] = [Self::MatrixGame];
+    pub const ALL: [Self; 4] =
+        [Self::MatrixGame, Self::CooperativeNavigation, Self::PredatorPrey, Self::PredatorPreyPro];
 
     /// The tasks of one split, in a fixed order: a task's index is its place among the training tasks.
     pub fn tasks(self, split: Split) -> Vec<Task> {
         match (self, split) {
-            (Self::MatrixGame, Split::Training) => (0..MatrixGame::GAMES)
-                .map(|game| Task::MatrixGame { game })
-                .collect(),
+            (Self::MatrixGame, Split::Training) => {
+                (0..MatrixGame::GAMES).map(|game| Task::MatrixGame { game }).collect()
+            }
             (Self::MatrixGame, Split::Testing) => vec![],
+            (Self::CooperativeNavigation, Split::Training) => navigation([2, 3, 4]),
+            (Self::CooperativeNavigation, Split::Testing) => navigation([5, 6]),
+            (Self::PredatorPrey, Split::Training) => hunts(PredatorPreyReward::Plain, TRAINING_HUNTS),
+            (Self::PredatorPrey, Split::Testing) => hunts(PredatorPreyReward::Plain, TESTING_HUNTS),
+            (Self::PredatorPreyPro, Split::Training) => hunts(PredatorPreyReward::Pro, TRAINING_HUNTS),
+            (Self::PredatorPreyPro, Split::Testing) => hunts(PredatorPreyReward::Pro, TESTING_HUNTS),
         }
+    }
+
+    /// The task of this name, be it for training or for testing.
+    ///
+    /// # Errors
+    /// When no task of the set is called so.
+    pub fn task(self, name: &str) -> Result<Task, UnknownName> {
+        let tasks = [self.tasks(Split::Training), self.tasks(Split::Testing)].concat();
+        UnknownName::look_up("task", name, &tasks)
     }
 
     /// Whether its tasks know winning.
     pub fn has_wins(self) -> bool {
         match self {
             Self::MatrixGame => true,
+            Self::CooperativeNavigation | Self::PredatorPrey | Self::PredatorPreyPro => false,
         }
     }
 
     /// The padded sizes over all its tasks, testing tasks included (paper, appendix A).
     pub fn dims(self) -> Dims {
-        let tasks = [Split::Training, Split::Testing]
-            .into_iter()
-            .flat_map(|split| self.tasks(split));
-        let mut dims = Dims {
-            entity_dim: 0,
-            n_actions: 0,
-            agents_max: 0,
-            entities_max: 0,
-            steps_max: 0,
-        };
+        let tasks = [Split::Training, Split::Testing].into_iter().flat_map(|split| self.tasks(split));
+        let mut dims = Dims { entity_dim: 0, n_actions: 0, agents_max: 0, entities_max: 0, steps_max: 0 };
         let mut others_max = 0;
-        for environment in tasks.map(Task::environment) {
+        for task in tasks {
+            // No option changes a size.
+            let environment = task.environment(EnvironmentOptions::default());
             dims.entity_dim = environment.feature_dim() + environment.n_actions();
             dims.n_actions = environment.n_actions();
             dims.agents_max = dims.agents_max.max(environment.n_agents());
             others_max = others_max.max(environment.n_entities() - environment.n_agents());
             dims.steps_max = dims.steps_max.max(environment.steps_max());
         }
-        Dims {
-            entities_max: dims.agents_max + others_max,
-            ..dims
-        }
+        Dims { entities_max: dims.agents_max + others_max, ..dims }
     }
 }
 
 impl Task {
     /// Makes the task's world.
-    pub fn environment(self) -> Box<dyn Environment> {
+    ///
+    /// # Panics
+    /// With a view radius that is negative or not a number.
+    pub fn environment(self, options: EnvironmentOptions) -> Box<dyn Environment> {
         match self {
             Self::MatrixGame { game } => Box::new(MatrixGame::new(game)),
+            Self::CooperativeNavigation { n } => Box::new(CooperativeNavigation::new(n, options)),
+            Self::PredatorPrey { predators, prey, reward } => {
+                Box::new(PredatorPrey::new(predators, prey, reward, options))
+            }
         }
     }
 
     /// The task's real sizes.
     pub fn size(self) -> TaskSize {
-        let environment = self.environment();
-        TaskSize {
-            n_agents: environment.n_agents(),
-            n_entities: environment.n_entities(),
-        }
+        let environment = self.environment(EnvironmentOptions::default());
+        TaskSize { n_agents: environment.n_agents(), n_entities: environment.n_entities() }
     }
 }
 
@@ -114,6 +142,9 @@ impl fmt::Display for TaskSet {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::MatrixGame => "matrix-game",
+            Self::CooperativeNavigation => "cooperative-navigation",
+            Self::PredatorPrey => "predator-prey",
+            Self::PredatorPreyPro => "predator-prey-pro",
         })
     }
 }
@@ -122,6 +153,14 @@ impl fmt::Display for Task {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::MatrixGame { game } => write!(f, "game-{}", game + 1),
+            Self::CooperativeNavigation { n } => write!(f, "navigation-{n}-{n}"),
+            Self::PredatorPrey { predators, prey, reward } => {
+                let series = match reward {
+                    PredatorPreyReward::Plain => "predator-prey",
+                    PredatorPreyReward::Pro => "predator-prey-pro",
+                };
+                write!(f, "{series}-{predators}-{prey}")
+            }
         }
     }
 }
@@ -130,15 +169,17 @@ impl FromStr for TaskSet {
     type Err = UnknownName;
 
     fn from_str(name: &str) -> Result<Self, UnknownName> {
-        Self::ALL
-            .into_iter()
-            .find(|set| set.to_string() == name)
-            .ok_or_else(|| UnknownName {
-                what: "task set",
-                name: name.to_owned(),
-                known: Self::ALL.map(|set| set.to_string()).to_vec(),
-            })
+        UnknownName::look_up("task set", name, &Self::ALL)
     }
+}
+
+fn navigation<const N: usize>(sizes: [usize; N]) -> Vec<Task> {
+    sizes.map(|n| Task::CooperativeNavigation { n }).to_vec()
+}
+
+fn hunts<const N: usize>(reward: PredatorPreyReward, sizes: [(usize, usize); N]) -> Vec<Task> {
+    let task = |(predators, prey)| Task::PredatorPrey { predators, prey, reward };
+    sizes.map(task).to_vec()
 }
 
 #[cfg(test)]
@@ -146,21 +187,57 @@ mod tests {
     use super::*;
     use crate::conformance;
 
+    fn all_tasks(set: TaskSet) -> Vec<Task> {
+        [set.tasks(Split::Training), set.tasks(Split::Testing)].concat()
+    }
+
     #[test]
     fn every_task_of_every_set_conforms() {
         for set in TaskSet::ALL {
-            for split in [Split::Training, Split::Testing] {
-                for task in set.tasks(split) {
-                    conformance::check(|| task.environment());
-                    let (dims, size) = (set.dims(), task.size());
-                    assert!(size.n_agents <= dims.agents_max, "{task}");
-                    assert!(
-                        size.n_entities - size.n_agents <= dims.entities_max - dims.agents_max,
-                        "{task}"
-                    );
-                }
+            for task in all_tasks(set) {
+                conformance::check(|| task.environment(EnvironmentOptions::default()));
             }
-            assert_eq!(set.dims().validate(), Ok(()));
+            let short_sighted = EnvironmentOptions { view_radius: Some(0.5) };
+            conformance::check(|| set.tasks(Split::Training)[0].environment(short_sighted));
+        }
+    }
+
+    #[test]
+    fn dims_hold_every_task() {
+        for set in TaskSet::ALL {
+            let dims = set.dims();
+            assert_eq!(dims.validate(), Ok(()));
+            for task in all_tasks(set) {
+                let size = task.size();
+                assert!(size.n_agents <= dims.agents_max, "{task}");
+                assert!(size.n_entities - size.n_agents <= dims.entities_max - dims.agents_max, "{task}");
+            }
+        }
+        // Six agents and six landmarks; five predators, two obstacles and two prey.
+        for (set, agents_max, entities_max) in [
+            (TaskSet::CooperativeNavigation, 6, 12),
+            (TaskSet::PredatorPrey, 5, 9),
+            (TaskSet::PredatorPreyPro, 5, 9),
+        ] {
+            let expected = Dims { entity_dim: 12, n_actions: 5, agents_max, entities_max, steps_max: 25 };
+            assert_eq!(set.dims(), expected, "{set}");
+        }
+    }
+
+    #[test]
+    fn tasks_are_those_of_the_paper() {
+        let hunts = [["2-1", "3-1", "3-2"].as_slice(), ["4-2", "5-2"].as_slice()];
+        for (set, prefix, sizes) in [
+            (TaskSet::MatrixGame, "game", [["1", "2", "3", "4"].as_slice(), &[]]),
+            (TaskSet::CooperativeNavigation, "navigation", [&["2-2", "3-3", "4-4"], &["5-5", "6-6"]]),
+            (TaskSet::PredatorPrey, "predator-prey", hunts),
+            (TaskSet::PredatorPreyPro, "predator-prey-pro", hunts),
+        ] {
+            for (split, sizes) in [Split::Training, Split::Testing].into_iter().zip(sizes) {
+                let names: Vec<String> = set.tasks(split).iter().map(Task::to_string).collect();
+                let expected: Vec<String> = sizes.iter().map(|size| format!("{prefix}-{size}")).collect();
+                assert_eq!(names, expected);
+            }
         }
     }
 
@@ -168,12 +245,16 @@ mod tests {
     fn names_lead_back() {
         for set in TaskSet::ALL {
             assert_eq!(set.to_string().parse(), Ok(set));
+            for task in all_tasks(set) {
+                assert_eq!(set.task(&task.to_string()), Ok(task));
+            }
         }
         let unknown = "matrixgame".parse::<TaskSet>().unwrap_err();
-        assert!(
-            unknown
-                .to_string()
-                .starts_with("unknown task set \"matrixgame\"; known: matrix-game")
+        assert!(unknown.to_string().starts_with("unknown task set \"matrixgame\"; known: matrix-game"));
+        assert_eq!(
+            TaskSet::CooperativeNavigation.task("predator-prey-3-1").unwrap_err().to_string(),
+            "unknown task \"predator-prey-3-1\"; known: navigation-2-2, navigation-3-3, navigation-4-4, \
+             navigation-5-5, navigation-6-6"
         );
     }
 }

@@ -15,10 +15,7 @@ pub fn draw(n_agents: usize, rng: &mut Rng) -> Vec<u8> {
 /// # Panics
 /// With more agents than [`crate::Dims::ENTITIES_LIMIT`].
 pub fn identity(n_agents: usize) -> Vec<u8> {
-    assert!(
-        n_agents <= crate::Dims::ENTITIES_LIMIT,
-        "an agent's index is one byte"
-    );
+    assert!(n_agents <= crate::Dims::ENTITIES_LIMIT, "an agent's index is one byte");
     (0..n_agents).map(|agent| agent as u8).collect()
 }
 
@@ -46,10 +43,7 @@ mod tests {
         }
         assert_eq!(counts.len(), 6);
         // 1000 expected of each, standard deviation 29: five of them either way.
-        assert!(
-            counts.values().all(|&count| (855..1145).contains(&count)),
-            "{counts:?}"
-        );
+        assert!(counts.values().all(|&count| (855..1145).contains(&count)), "{counts:?}");
     }
 
     #[test]

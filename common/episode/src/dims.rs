@@ -50,31 +50,12 @@ impl Dims {
     /// The first field that is out of range.
     pub fn validate(&self) -> Result<(), DimsError> {
         let within = |name, value, min, max| {
-            if (min..=max).contains(&value) {
-                Ok(())
-            } else {
-                Err(DimsError {
-                    name,
-                    value,
-                    min,
-                    max,
-                })
-            }
+            if (min..=max).contains(&value) { Ok(()) } else { Err(DimsError { name, value, min, max }) }
         };
-        within(
-            "entity_dim",
-            self.entity_dim,
-            self.n_actions + 1,
-            Self::FEATURES_LIMIT,
-        )?;
+        within("entity_dim", self.entity_dim, self.n_actions + 1, Self::FEATURES_LIMIT)?;
         within("n_actions", self.n_actions, 1, Self::ACTIONS_LIMIT)?;
         within("agents_max", self.agents_max, 1, Self::ENTITIES_LIMIT)?;
-        within(
-            "entities_max",
-            self.entities_max,
-            self.agents_max,
-            Self::ENTITIES_LIMIT,
-        )?;
+        within("entities_max", self.entities_max, self.agents_max, Self::ENTITIES_LIMIT)?;
         within("steps_max", self.steps_max, 1, Self::STEPS_LIMIT)
     }
 }
@@ -85,35 +66,11 @@ mod tests {
 
     #[test]
     fn names_the_field_that_is_out_of_range() {
-        let good = Dims {
-            entity_dim: 6,
-            n_actions: 3,
-            agents_max: 2,
-            entities_max: 2,
-            steps_max: 2,
-        };
+        let good = Dims { entity_dim: 6, n_actions: 3, agents_max: 2, entities_max: 2, steps_max: 2 };
         assert_eq!(good.validate(), Ok(()));
-        let fewer_entities_than_agents = Dims {
-            entities_max: 1,
-            ..good
-        };
-        assert_eq!(
-            fewer_entities_than_agents.validate().unwrap_err().name,
-            "entities_max"
-        );
-        assert_eq!(
-            Dims { steps_max: 0, ..good }.validate().unwrap_err().name,
-            "steps_max"
-        );
-        assert_eq!(
-            Dims {
-                entity_dim: 3,
-                ..good
-            }
-            .validate()
-            .unwrap_err()
-            .name,
-            "entity_dim"
-        );
+        let fewer_entities_than_agents = Dims { entities_max: 1, ..good };
+        assert_eq!(fewer_entities_than_agents.validate().unwrap_err().name, "entities_max");
+        assert_eq!(Dims { steps_max: 0, ..good }.validate().unwrap_err().name, "steps_max");
+        assert_eq!(Dims { entity_dim: 3, ..good }.validate().unwrap_err().name, "entity_dim");
     }
 }

@@ -118,9 +118,7 @@ impl EpisodeBuilder {
         debug_assert_eq!(observation.n_agents(), self.episode.n_agents);
         debug_assert_eq!(observation.n_entities(), self.episode.n_entities);
         self.episode.entities.extend_from_slice(observation.entities());
-        self.episode
-            .observable
-            .extend_from_slice(observation.observable());
+        self.episode.observable.extend_from_slice(observation.observable());
         self.episode.available.extend_from_slice(observation.available());
     }
 }

@@ -66,13 +66,7 @@ mod tests {
 
     #[test]
     fn every_name_and_index_is_a_stream_of_its_own() {
-        let streams = [
-            Stream::Weights,
-            Stream::Replay,
-            Stream::Pairing,
-            Stream::Task,
-            Stream::DecisionOrder,
-        ];
+        let streams = [Stream::Weights, Stream::Replay, Stream::Pairing, Stream::Task, Stream::DecisionOrder];
         let mut first = HashSet::new();
         for seed in 0..3 {
             for stream in streams {
@@ -88,13 +82,7 @@ mod tests {
         // Pinned: a change here would change what every saved seed means.
         assert_eq!(RunSeed(1).stream(Stream::Weights, 0).next_u64(), 4_344_717_217_939_160_907);
         assert_eq!(RunSeed(7).derive("evaluation", 3).0, 6_893_911_044_260_831_460);
-        assert_ne!(
-            RunSeed(7).derive("evaluation", 3),
-            RunSeed(7).derive("evaluation", 4)
-        );
-        assert_ne!(
-            RunSeed(7).derive("evaluation", 3),
-            RunSeed(7).derive("zero-shot", 3)
-        );
+        assert_ne!(RunSeed(7).derive("evaluation", 3), RunSeed(7).derive("evaluation", 4));
+        assert_ne!(RunSeed(7).derive("evaluation", 3), RunSeed(7).derive("zero-shot", 3));
     }
 }

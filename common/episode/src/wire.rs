@@ -95,13 +95,7 @@ pub struct PayloadLayout {
 impl PayloadLayout {
     /// The layout of a run's payloads.
     pub fn new(dims: Dims) -> Self {
-        let Dims {
-            entity_dim,
-            n_actions,
-            agents_max,
-            entities_max,
-            steps_max,
-        } = dims;
+        let Dims { entity_dim, n_actions, agents_max, entities_max, steps_max } = dims;
         let rows = steps_max + 1;
         let rewards = 4 * rows * entities_max * entity_dim;
         let observable = rewards + 4 * steps_max;
@@ -109,15 +103,7 @@ impl PayloadLayout {
         let actions = available + rows * agents_max * n_actions;
         let decision_order = actions + steps_max * agents_max;
         let len = (decision_order + agents_max).next_multiple_of(ALIGNMENT);
-        Self {
-            dims,
-            rewards,
-            observable,
-            available,
-            actions,
-            decision_order,
-            len,
-        }
+        Self { dims, rewards, observable, available, actions, decision_order, len }
     }
 
     /// Bytes of a payload.
@@ -166,10 +152,7 @@ pub struct Frame {
 impl Frame {
     /// A frame of zeros of the layout's length: what [`encode`] writes into.
     pub fn new(layout: &PayloadLayout) -> Self {
-        Self {
-            header: Header::zeroed(),
-            payload: vec![0; layout.len()],
-        }
+        Self { header: Header::zeroed(), payload: vec![0; layout.len()] }
     }
 }
 
@@ -184,13 +167,7 @@ pub fn encode(
     actor: u32,
     frame: &mut Frame,
 ) -> Result<(), EncodeError> {
-    let Dims {
-        entity_dim: d,
-        n_actions,
-        agents_max,
-        entities_max,
-        steps_max,
-    } = layout.dims;
+    let Dims { entity_dim: d, n_actions, agents_max, entities_max, steps_max } = layout.dims;
     let (n, m, steps) = (episode.n_agents, episode.n_entities, episode.steps());
     let fits = n >= 1
         && n <= agents_max
@@ -203,12 +180,7 @@ pub fn encode(
         && episode.actions.len() == steps * n
         && episode.decision_order.len() == n;
     if !fits {
-        return Err(EncodeError {
-            n_agents: n,
-            n_entities: m,
-            steps,
-            dims: layout.dims,
-        });
+        return Err(EncodeError { n_agents: n, n_entities: m, steps, dims: layout.dims });
     }
 
     frame.payload.clear();
@@ -382,13 +354,7 @@ impl Rejection {
 pub fn decode(header: &Header, payload: &[u8], expected: &Expected) -> Result<Episode, Rejection> {
     let layout = &expected.layout;
     check_header(header, payload, expected)?;
-    let Dims {
-        entity_dim: d,
-        n_actions,
-        agents_max,
-        entities_max,
-        ..
-    } = layout.dims;
+    let Dims { entity_dim: d, n_actions, agents_max, entities_max, .. } = layout.dims;
     let (n, m) = (usize::from(header.n_agents), usize::from(header.n_entities));
     let steps = usize::from(header.steps);
 
@@ -418,20 +384,14 @@ pub fn decode(header: &Header, payload: &[u8], expected: &Expected) -> Result<Ep
     let decision_order = payload[layout.decision_order..][..n].to_vec();
 
     for (section, numbers) in [("entities", &entities), ("rewards", &rewards)] {
-        if !numbers
-            .iter()
-            .fold(true, |finite, number| finite & number.is_finite())
-        {
+        if !numbers.iter().fold(true, |finite, number| finite & number.is_finite()) {
             return Err(Rejection::NotFinite { section });
         }
     }
     for (section, flags) in [("observable", &observable), ("available", &available)] {
         let worst = flags.iter().fold(0, |worst, &flag| worst.max(flag));
         if worst > 1 {
-            return Err(Rejection::Flag {
-                field: section,
-                value: worst,
-            });
+            return Err(Rejection::Flag { field: section, value: worst });
         }
     }
     if !decision_order::is_permutation(&decision_order) {
@@ -439,11 +399,7 @@ pub fn decode(header: &Header, payload: &[u8], expected: &Expected) -> Result<Ep
     }
     for (row, (&action, allowed)) in actions.iter().zip(available.chunks_exact(n_actions)).enumerate() {
         if allowed.get(usize::from(action)) != Some(&1) {
-            return Err(Rejection::Action {
-                step: row / n,
-                agent: row % n,
-                action,
-            });
+            return Err(Rejection::Action { step: row / n, agent: row % n, action });
         }
     }
 
@@ -459,11 +415,7 @@ pub fn decode(header: &Header, payload: &[u8], expected: &Expected) -> Result<Ep
         available,
         actions,
         rewards,
-        end: if header.end == 1 {
-            End::Terminated
-        } else {
-            End::Truncated
-        },
+        end: if header.end == 1 { End::Terminated } else { End::Truncated },
         won: header.won == 1,
     })
 }
@@ -475,100 +427,53 @@ fn check_header(header: &Header, payload: &[u8], expected: &Expected) -> Result<
         return Err(Rejection::Magic);
     }
     if header.layout_version != LAYOUT_VERSION {
-        return Err(Rejection::LayoutVersion {
-            found: header.layout_version,
-        });
+        return Err(Rejection::LayoutVersion { found: header.layout_version });
     }
     if header.run_id != expected.run_id {
         return Err(Rejection::Run);
     }
-    let found = [
-        header.entity_dim,
-        header.n_actions,
-        header.agents_max,
-        header.entities_max,
-        header.steps_max,
-    ];
-    let run = [
-        dims.entity_dim,
-        dims.n_actions,
-        dims.agents_max,
-        dims.entities_max,
-        dims.steps_max,
-    ];
+    let found =
+        [header.entity_dim, header.n_actions, header.agents_max, header.entities_max, header.steps_max];
+    let run = [dims.entity_dim, dims.n_actions, dims.agents_max, dims.entities_max, dims.steps_max];
     if found.map(usize::from) != run {
         return Err(Rejection::Dims);
     }
     if payload.len() != expected.layout.len || header.payload_len != expected.layout.len as u64 {
-        return Err(Rejection::Length {
-            found: payload.len(),
-            expected: expected.layout.len,
-        });
+        return Err(Rejection::Length { found: payload.len(), expected: expected.layout.len });
     }
     if header.checksum != checksum(header, payload) {
         return Err(Rejection::Checksum);
     }
-    let size = TaskSize {
-        n_agents: header.n_agents.into(),
-        n_entities: header.n_entities.into(),
-    };
+    let size = TaskSize { n_agents: header.n_agents.into(), n_entities: header.n_entities.into() };
     if expected.tasks.get(header.task as usize) != Some(&size) {
-        let Header {
-            task,
-            n_agents,
-            n_entities,
-            ..
-        } = *header;
-        return Err(Rejection::Task {
-            task,
-            n_agents,
-            n_entities,
-        });
+        let Header { task, n_agents, n_entities, .. } = *header;
+        return Err(Rejection::Task { task, n_agents, n_entities });
     }
     if header.steps == 0 || usize::from(header.steps) > dims.steps_max {
-        return Err(Rejection::Steps {
-            found: header.steps,
-            limit: dims.steps_max,
-        });
+        return Err(Rejection::Steps { found: header.steps, limit: dims.steps_max });
     }
     if !(1..=2).contains(&header.end) {
-        return Err(Rejection::Flag {
-            field: "end",
-            value: header.end,
-        });
+        return Err(Rejection::Flag { field: "end", value: header.end });
     }
     if header.won > 1 {
-        return Err(Rejection::Flag {
-            field: "won",
-            value: header.won,
-        });
+        return Err(Rejection::Flag { field: "won", value: header.won });
     }
     if let Some(&value) = header.reserved.iter().find(|&&byte| byte != 0) {
-        return Err(Rejection::Flag {
-            field: "reserved",
-            value,
-        });
+        return Err(Rejection::Flag { field: "reserved", value });
     }
     Ok(())
 }
 
 fn checksum(header: &Header, payload: &[u8]) -> u32 {
     let mut crc = crc32fast::Hasher::new();
-    crc.update(bytemuck::bytes_of(&Header {
-        checksum: 0,
-        ..*header
-    }));
+    crc.update(bytemuck::bytes_of(&Header { checksum: 0, ..*header }));
     crc.update(payload);
     crc.finalize()
 }
 
 /// A real entity's row in the padded order: non-agents begin behind the padded agents.
 fn padded_entity(row: usize, n_agents: usize, agents_max: usize) -> usize {
-    if row < n_agents {
-        row
-    } else {
-        row - n_agents + agents_max
-    }
+    if row < n_agents { row } else { row - n_agents + agents_max }
 }
 
 fn extend_f32(to: &mut Vec<f32>, bytes: &[u8]) {

@@ -63,19 +63,11 @@ impl Attention {
         let query = Linear::new(layout, &format!("{name}.query"), inputs, dim);
         let (key, value) = (format!("{name}.key"), format!("{name}.value"));
         let key_value = Linear::side_by_side(layout, inputs, &[(&key, dim), (&value, dim)]);
-        Self {
-            query,
-            key_value,
-            heads,
-            dim,
-        }
+        Self { query, key_value, heads, dim }
     }
 
     /// Writes `out` (Q, a) from `x_queries` (Q, h) and `x_keys` (K, h).
-    #[allow(
-        clippy::too_many_arguments,
-        reason = "a matrix and its companions, each named"
-    )]
+    #[allow(clippy::too_many_arguments, reason = "a matrix and its companions, each named")]
     pub fn forward(
         &self,
         params: &[f32],
@@ -119,10 +111,7 @@ impl Attention {
 
     /// Takes `d_out` (Q, a). Writes `dx_queries` (Q, h) and `dx_keys` (K, h) and adds to the parameters'
     /// gradients.
-    #[allow(
-        clippy::too_many_arguments,
-        reason = "a matrix and its companions, each named"
-    )]
+    #[allow(clippy::too_many_arguments, reason = "a matrix and its companions, each named")]
     pub fn backward(
         &self,
         params: &[f32],
@@ -169,10 +158,8 @@ impl Attention {
         let values = View::dense(key_values, 2 * a).columns(a..2 * a);
         crate::activation::relu_backward(values, ViewMut::dense(d_key_values, 2 * a).columns(a..2 * a));
         let (d_queries, d_key_values) = (View::dense(queries, a), View::dense(d_key_values, 2 * a));
-        self.query
-            .backward(params, x_queries, d_queries, Some(dx_queries), grads);
-        self.key_value
-            .backward(params, x_keys, d_key_values, Some(dx_keys), grads);
+        self.query.backward(params, x_queries, d_queries, Some(dx_queries), grads);
+        self.key_value.backward(params, x_keys, d_key_values, Some(dx_keys), grads);
     }
 }
 
@@ -202,11 +189,7 @@ fn attend(
     let mut total = 0.0;
     for (key, weight) in weights.iter_mut().enumerate() {
         // An unseen key weighs exactly nothing; a query that sees none keeps its zeros.
-        *weight = if sees(key) {
-            math::exp(*weight - largest)
-        } else {
-            0.0
-        };
+        *weight = if sees(key) { math::exp(*weight - largest) } else { 0.0 };
         total += *weight;
     }
     if total == 0.0 {
@@ -293,16 +276,7 @@ mod tests {
     const SEEN: [u8; 8] = [1, 1, 1, 0, 1, 1, 0, 0];
 
     fn groups() -> [Group; 2] {
-        [
-            Group {
-                queries: 0..2,
-                keys: 0..3,
-            },
-            Group {
-                queries: 2..3,
-                keys: 3..5,
-            },
-        ]
+        [Group { queries: 0..2, keys: 0..3 }, Group { queries: 2..3, keys: 3..5 }]
     }
 
     fn unit(heads: usize) -> (Attention, usize) {
@@ -320,15 +294,7 @@ mod tests {
     ) -> (Vec<f32>, AttentionState) {
         let (mut out, mut state) = (vec![9.0; 3 * DIM], AttentionState::default());
         let (xq, xk) = (View::dense(xq, INPUTS), View::dense(xk, INPUTS));
-        attention.forward(
-            params,
-            xq,
-            xk,
-            &groups(),
-            visible,
-            &mut state,
-            ViewMut::dense(&mut out, DIM),
-        );
+        attention.forward(params, xq, xk, &groups(), visible, &mut state, ViewMut::dense(&mut out, DIM));
         (out, state)
     }
 
@@ -336,11 +302,7 @@ mod tests {
     fn reference(attention: &Attention, params: &[f32], xq: &[f32], xk: &[f32], seen: &[u8]) -> Vec<f32> {
         let project = |linear: &Linear, x: &[f32]| -> Vec<f32> {
             let mut y = vec![0.0; x.len() / INPUTS * linear.outputs];
-            linear.forward(
-                params,
-                View::dense(x, INPUTS),
-                ViewMut::dense(&mut y, linear.outputs),
-            );
+            linear.forward(params, View::dense(x, INPUTS), ViewMut::dense(&mut y, linear.outputs));
             y
         };
         let (q, kv) = (project(&attention.query, xq), project(&attention.key_value, xk));
@@ -354,24 +316,15 @@ mod tests {
                 for column in 0..DIM {
                     let head = column / head_dim * head_dim..(column / head_dim + 1) * head_dim;
                     let weight = |key: usize| -> f32 {
-                        let score: f32 = head
-                            .clone()
-                            .map(|c| q[query * DIM + c] * kv[key * 2 * DIM + c])
-                            .sum();
+                        let score: f32 =
+                            head.clone().map(|c| q[query * DIM + c] * kv[key * 2 * DIM + c]).sum();
                         (score / (head_dim as f32).sqrt()).exp()
                     };
-                    let keys = || {
-                        group
-                            .keys
-                            .clone()
-                            .zip(flags)
-                            .filter(|(_, seen)| **seen == 1)
-                            .map(|(key, _)| key)
-                    };
+                    let keys =
+                        || group.keys.clone().zip(flags).filter(|(_, seen)| **seen == 1).map(|(key, _)| key);
                     let total: f32 = keys().map(weight).sum();
-                    let sum: f32 = keys()
-                        .map(|key| weight(key) * kv[key * 2 * DIM + DIM + column].max(0.0))
-                        .sum();
+                    let sum: f32 =
+                        keys().map(|key| weight(key) * kv[key * 2 * DIM + DIM + column].max(0.0)).sum();
                     out[query * DIM + column] = if total > 0.0 { sum / total } else { 0.0 };
                 }
             }
@@ -401,23 +354,9 @@ mod tests {
         assert_eq!(out[2 * DIM..], [0.0; DIM]);
         let (mut dxq, mut dxk, mut grads) = (vec![9.0; xq.len()], vec![9.0; xk.len()], vec![0.0; len]);
         let d_out = noise(4, 3 * DIM);
-        let views = (
-            View::dense(&xq, INPUTS),
-            View::dense(&xk, INPUTS),
-            View::dense(&d_out, DIM),
-        );
+        let views = (View::dense(&xq, INPUTS), View::dense(&xk, INPUTS), View::dense(&d_out, DIM));
         let (to_q, to_k) = (ViewMut::dense(&mut dxq, INPUTS), ViewMut::dense(&mut dxk, INPUTS));
-        attention.backward(
-            &params,
-            views.0,
-            views.1,
-            &groups(),
-            &mut state,
-            views.2,
-            to_q,
-            to_k,
-            &mut grads,
-        );
+        attention.backward(&params, views.0, views.1, &groups(), &mut state, views.2, to_q, to_k, &mut grads);
         assert_eq!(dxq[2 * INPUTS..], [0.0; INPUTS]);
         assert_eq!(dxk[3 * INPUTS..], [0.0; 2 * INPUTS]);
     }
@@ -426,23 +365,15 @@ mod tests {
     fn gradients_are_the_numeric_ones() {
         for (heads, visible) in [(1, Visible::All), (2, Visible::Where(&SEEN)), (3, Visible::All)] {
             let (attention, len) = unit(heads);
-            let (params, xq, xk, to) = (
-                noise(1, len),
-                noise(2, 3 * INPUTS),
-                noise(3, 5 * INPUTS),
-                noise(4, 3 * DIM),
-            );
+            let (params, xq, xk, to) =
+                (noise(1, len), noise(2, 3 * INPUTS), noise(3, 5 * INPUTS), noise(4, 3 * DIM));
             let loss = |params: &[f32], xq: &[f32], xk: &[f32]| {
                 let (out, _) = run(&attention, params, xq, xk, visible);
                 out.iter().zip(&to).map(|(out, to)| f64::from(out * to)).sum()
             };
             let (_, mut state) = run(&attention, &params, &xq, &xk, visible);
             let (mut dxq, mut dxk, mut grads) = (vec![0.0; xq.len()], vec![0.0; xk.len()], vec![0.0; len]);
-            let views = (
-                View::dense(&xq, INPUTS),
-                View::dense(&xk, INPUTS),
-                View::dense(&to, DIM),
-            );
+            let views = (View::dense(&xq, INPUTS), View::dense(&xk, INPUTS), View::dense(&to, DIM));
             let (to_q, to_k) = (ViewMut::dense(&mut dxq, INPUTS), ViewMut::dense(&mut dxk, INPUTS));
             attention.backward(
                 &params,

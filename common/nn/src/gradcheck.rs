@@ -26,10 +26,7 @@ pub fn noise(seed: u64, len: usize) -> Vec<f32> {
 pub fn check(name: &str, at: &[f32], gradient: &[f32], loss: impl Fn(&[f32]) -> f64) {
     const STEPS: [f32; 2] = [2e-3, 2e-4];
     assert_eq!(at.len(), gradient.len());
-    assert!(
-        gradient.iter().any(|&g| g != 0.0),
-        "{name}: a gradient of zeros shows nothing"
-    );
+    assert!(gradient.iter().any(|&g| g != 0.0), "{name}: a gradient of zeros shows nothing");
     let largest = gradient.iter().fold(0.0_f32, |largest, g| largest.max(g.abs()));
     let scale = loss(at).abs().max(1.0) as f32;
     let mut moved = at.to_vec();
@@ -51,10 +48,6 @@ pub fn check(name: &str, at: &[f32], gradient: &[f32], loss: impl Fn(&[f32]) -> 
             numeric = difference(step);
             agrees(numeric, step)
         });
-        assert!(
-            found,
-            "{name}[{element}]: {} written, {numeric} measured",
-            gradient[element]
-        );
+        assert!(found, "{name}[{element}]: {} written, {numeric} measured", gradient[element]);
     }
 }

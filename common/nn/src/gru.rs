@@ -40,11 +40,7 @@ impl Gru {
         };
         let input = declare("weight_ih", "bias_ih", inputs);
         let hidden = declare("weight_hh", "bias_hh", hidden_dim);
-        Self {
-            input,
-            hidden,
-            hidden_dim,
-        }
+        Self { input, hidden, hidden_dim }
     }
 
     /// Runs over all times. `state.gates` holds the input's share already (see [`Gru::input`]); `times[t]` is
@@ -56,10 +52,7 @@ impl Gru {
         debug_assert_eq!(state.gates.len(), rows * 3 * h);
         crate::fit(&mut state.from_hidden, rows * 3 * h);
         crate::fit(&mut state.history, rows * h);
-        linear::fill_rows(
-            ViewMut::dense(&mut state.from_hidden, 3 * h),
-            self.hidden.bias(params),
-        );
+        linear::fill_rows(ViewMut::dense(&mut state.from_hidden, 3 * h), self.hidden.bias(params));
         for (time, range) in times.windows(2).map(|pair| pair[0]..pair[1]).enumerate() {
             let (done, ahead) = state.history.split_at_mut(range.start * h);
             let previous = if time == 0 {
@@ -77,12 +70,7 @@ impl Gru {
                 for row in 0..range.len() {
                     let previous = previous.map_or(&[][..], |previous| previous.row(row));
                     let at = row * 3 * h..(row + 1) * 3 * h;
-                    step(
-                        &mut gates[at.clone()],
-                        &from_hidden[at],
-                        previous,
-                        &mut ahead[row * h..][..h],
-                    );
+                    step(&mut gates[at.clone()], &from_hidden[at], previous, &mut ahead[row * h..][..h]);
                 }
             });
         }
@@ -211,8 +199,7 @@ mod tests {
     fn run(gru: &Gru, params: &[f32], x: &[f32], times: &[usize], before: Option<View<'_>>) -> GruState {
         let mut state = GruState::default();
         let gates = crate::fit(&mut state.gates, x.len() / INPUTS * 3 * H);
-        gru.input
-            .forward(params, View::dense(x, INPUTS), ViewMut::dense(gates, 3 * H));
+        gru.input.forward(params, View::dense(x, INPUTS), ViewMut::dense(gates, 3 * H));
         gru.forward(params, times, before, &mut state);
         state
     }
@@ -276,24 +263,14 @@ mod tests {
         let (params, x, to) = (noise(1, len), noise(2, 6 * INPUTS), noise(3, 6 * H));
         let loss = |params: &[f32], x: &[f32]| {
             let state = run(&gru, params, x, &TIMES, None);
-            state
-                .history
-                .iter()
-                .zip(&to)
-                .map(|(h, to)| f64::from(h * to))
-                .sum()
+            state.history.iter().zip(&to).map(|(h, to)| f64::from(h * to)).sum()
         };
         let mut state = run(&gru, &params, &x, &TIMES, None);
         let (mut grads, mut dx, mut d_history) = (vec![0.0; len], vec![0.0; x.len()], to.clone());
         gru.backward(&params, &TIMES, &mut state, &mut d_history, &mut grads);
         let d_gates = View::dense(&state.gates, 3 * H);
         matmul::dyt_x(d_gates, View::dense(&x, INPUTS), gru.input.weight_mut(&mut grads));
-        matmul::dy_w(
-            d_gates,
-            gru.input.weight(&params),
-            ViewMut::dense(&mut dx, INPUTS),
-            Accum::Replace,
-        );
+        matmul::dy_w(d_gates, gru.input.weight(&params), ViewMut::dense(&mut dx, INPUTS), Accum::Replace);
         check("params", &params, &grads, |params| loss(params, &x));
         check("x", &x, &dx, |x| loss(&params, x));
     }

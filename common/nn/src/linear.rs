@@ -34,24 +34,14 @@ impl Linear {
             layout.add(format!("{name}.bias"), &[*outputs], bound);
         }
         let outputs = layers.iter().map(|(_, outputs)| outputs).sum();
-        Self {
-            weight: weights..biases,
-            bias: biases..layout.len(),
-            inputs,
-            outputs,
-        }
+        Self { weight: weights..biases, bias: biases..layout.len(), inputs, outputs }
     }
 
     /// A layer whose parameters are declared already: `weight` (outputs, inputs), `bias` (outputs).
     pub fn at(weight: Range<usize>, bias: Range<usize>, inputs: usize) -> Self {
         let outputs = bias.len();
         debug_assert_eq!(weight.len(), inputs * outputs);
-        Self {
-            weight,
-            bias,
-            inputs,
-            outputs,
-        }
+        Self { weight, bias, inputs, outputs }
     }
 
     /// The weight, (outputs, inputs).
@@ -169,13 +159,7 @@ mod tests {
         activation::relu_backward(View::dense(&y, 4), ViewMut::dense(&mut dy, 4));
         let (mut grads, mut dx) = (vec![0.0; params.len()], vec![0.0; x.len()]);
         let dx_view = Some(ViewMut::dense(&mut dx, 3));
-        linear.backward(
-            &params,
-            View::dense(&x, 3),
-            View::dense(&dy, 4),
-            dx_view,
-            &mut grads,
-        );
+        linear.backward(&params, View::dense(&x, 3), View::dense(&dy, 4), dx_view, &mut grads);
         check("params", &params, &grads, |params| loss(params, &x));
         check("x", &x, &dx, |x| loss(&params, x));
     }

@@ -26,14 +26,7 @@ pub fn dy_w(dy: View<'_>, w: View<'_>, dx: ViewMut<'_>, accum: Accum) {
 /// `dw += dyᵀ x`: a layer's backward to its weight. `dy` (rows, out), `x` (rows, in), `dw` (out, in).
 pub fn dyt_x(dy: View<'_>, x: View<'_>, dw: ViewMut<'_>) {
     debug_assert_eq!((dy.rows, dy.cols, x.cols), (x.rows, dw.rows, dw.cols));
-    matmul(
-        write(dw),
-        Accum::Add,
-        read(dy).transpose(),
-        read(x),
-        1.0_f32,
-        Par::Seq,
-    );
+    matmul(write(dw), Accum::Add, read(dy).transpose(), read(x), 1.0_f32, Par::Seq);
 }
 
 /// One row goes through faer's matrix–vector path, which sums in another order. A second row of zeros keeps
@@ -48,12 +41,7 @@ fn single_row(x: View<'_>, w: View<'_>, mut y: ViewMut<'_>, accum: Accum) {
     x_wt(
         View::dense(&two, x.cols),
         w,
-        ViewMut {
-            data: &mut out,
-            rows: 2,
-            cols: y.cols,
-            stride: y.cols,
-        },
+        ViewMut { data: &mut out, rows: 2, cols: y.cols, stride: y.cols },
         accum,
     );
     let cols = y.cols;
@@ -70,12 +58,7 @@ fn read(view: View<'_>) -> mat::MatRef<'_, f32> {
 }
 
 fn write(view: ViewMut<'_>) -> mat::MatMut<'_, f32> {
-    let ViewMut {
-        data,
-        rows,
-        cols,
-        stride,
-    } = view;
+    let ViewMut { data, rows, cols, stride } = view;
     let len = extent(data, rows, cols, stride).len();
     // faer 0.24's `from_row_major_slice_with_stride_mut` swaps the strides and writes out of bounds; a
     // column-major matrix transposed is the same view.
@@ -84,11 +67,7 @@ fn write(view: ViewMut<'_>) -> mat::MatMut<'_, f32> {
 
 /// The elements from a matrix's first to its last.
 fn extent(data: &[f32], rows: usize, cols: usize, stride: usize) -> &[f32] {
-    if rows == 0 || cols == 0 {
-        &[]
-    } else {
-        &data[..(rows - 1) * stride + cols]
-    }
+    if rows == 0 || cols == 0 { &[] } else { &data[..(rows - 1) * stride + cols] }
 }
 
 #[cfg(test)]
@@ -99,56 +78,29 @@ mod tests {
     #[test]
     fn products_are_what_the_loops_say() {
         let (rows, inputs, outputs) = (5, 3, 4);
-        let (x, w, dy) = (
-            noise(1, rows * inputs),
-            noise(2, outputs * inputs),
-            noise(3, rows * outputs),
-        );
-        let (mut y, mut dx, mut dw) = (
-            vec![9.0; rows * outputs],
-            vec![1.0; rows * inputs],
-            vec![1.0; outputs * inputs],
-        );
+        let (x, w, dy) = (noise(1, rows * inputs), noise(2, outputs * inputs), noise(3, rows * outputs));
+        let (mut y, mut dx, mut dw) =
+            (vec![9.0; rows * outputs], vec![1.0; rows * inputs], vec![1.0; outputs * inputs]);
         let view = |data, cols| View::dense(data, cols);
-        x_wt(
-            view(&x, inputs),
-            view(&w, inputs),
-            ViewMut::dense(&mut y, outputs),
-            Accum::Replace,
-        );
-        dy_w(
-            view(&dy, outputs),
-            view(&w, inputs),
-            ViewMut::dense(&mut dx, inputs),
-            Accum::Add,
-        );
-        dyt_x(
-            view(&dy, outputs),
-            view(&x, inputs),
-            ViewMut::dense(&mut dw, inputs),
-        );
+        x_wt(view(&x, inputs), view(&w, inputs), ViewMut::dense(&mut y, outputs), Accum::Replace);
+        dy_w(view(&dy, outputs), view(&w, inputs), ViewMut::dense(&mut dx, inputs), Accum::Add);
+        dyt_x(view(&dy, outputs), view(&x, inputs), ViewMut::dense(&mut dw, inputs));
         let close = |a: f32, b: f32| assert!((a - b).abs() < 1e-5, "{a} {b}");
         for row in 0..rows {
             for out in 0..outputs {
                 close(
                     y[row * outputs + out],
-                    (0..inputs)
-                        .map(|i| x[row * inputs + i] * w[out * inputs + i])
-                        .sum(),
+                    (0..inputs).map(|i| x[row * inputs + i] * w[out * inputs + i]).sum(),
                 );
             }
             for i in 0..inputs {
-                let sum: f32 = (0..outputs)
-                    .map(|out| dy[row * outputs + out] * w[out * inputs + i])
-                    .sum();
+                let sum: f32 = (0..outputs).map(|out| dy[row * outputs + out] * w[out * inputs + i]).sum();
                 close(dx[row * inputs + i], 1.0 + sum);
             }
         }
         for out in 0..outputs {
             for i in 0..inputs {
-                let sum: f32 = (0..rows)
-                    .map(|row| dy[row * outputs + out] * x[row * inputs + i])
-                    .sum();
+                let sum: f32 = (0..rows).map(|row| dy[row * outputs + out] * x[row * inputs + i]).sum();
                 close(dw[out * inputs + i], 1.0 + sum);
             }
         }
@@ -159,12 +111,7 @@ mod tests {
         let (x, w) = (noise(1, 6 * 5), noise(2, 2 * 3));
         let mut y = vec![7.0; 6 * 4];
         let x_columns = View::dense(&x, 5).columns(1..4);
-        x_wt(
-            x_columns,
-            View::dense(&w, 3),
-            ViewMut::dense(&mut y, 4).columns(1..3),
-            Accum::Replace,
-        );
+        x_wt(x_columns, View::dense(&w, 3), ViewMut::dense(&mut y, 4).columns(1..3), Accum::Replace);
         for row in 0..6 {
             assert_eq!((y[row * 4], y[row * 4 + 3]), (7.0, 7.0));
             let expected: f32 = (0..3).map(|i| x[row * 5 + 1 + i] * w[i]).sum();
@@ -187,11 +134,7 @@ mod tests {
             (9, 8),
             (192, 192),
         ] {
-            let (x, w, start) = (
-                noise(1, 300 * inputs),
-                noise(2, outputs * inputs),
-                noise(3, 300 * outputs),
-            );
+            let (x, w, start) = (noise(1, 300 * inputs), noise(2, outputs * inputs), noise(3, 300 * outputs));
             for accum in [Accum::Replace, Accum::Add] {
                 let run = |first: usize, rows: usize| {
                     let mut y = start[first * outputs..(first + rows) * outputs].to_vec();
@@ -201,9 +144,7 @@ mod tests {
                 };
                 let all = run(0, 300);
                 for (first, rows) in
-                    (1..64)
-                        .map(|rows| (rows % 7, rows))
-                        .chain([(3, 97), (0, 128), (50, 250)])
+                    (1..64).map(|rows| (rows % 7, rows)).chain([(3, 97), (0, 128), (50, 250)])
                 {
                     let part = run(first, rows);
                     assert!(

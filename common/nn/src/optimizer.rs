@@ -45,13 +45,7 @@ impl Optimizer {
             OptimizerKind::RmsProp { .. } => Vec::new(),
             OptimizerKind::Adam { .. } => vec![0.0; len],
         };
-        Self {
-            kind,
-            lr,
-            steps: 0,
-            mean,
-            mean_square: vec![0.0; len],
-        }
+        Self { kind, lr, steps: 0, mean, mean_square: vec![0.0; len] }
     }
 
     /// Takes one step along `scale · grads`.
@@ -117,10 +111,7 @@ mod tests {
     /// Two steps by hand, g = 0.5 then −1, p from 1.
     #[test]
     fn rmsprop_by_hand() {
-        let kind = OptimizerKind::RmsProp {
-            alpha: 0.9,
-            eps: 0.01,
-        };
+        let kind = OptimizerKind::RmsProp { alpha: 0.9, eps: 0.01 };
         let (mut optimizer, mut p) = (Optimizer::new(kind, 0.1, 1), [1.0]);
         optimizer.step(&mut p, &[0.5], 1.0);
         // v = 0.025; p = 1 − 0.1 · 0.5 / (0.158114 + 0.01)
@@ -133,11 +124,7 @@ mod tests {
 
     #[test]
     fn adam_by_hand() {
-        let kind = OptimizerKind::Adam {
-            beta1: 0.9,
-            beta2: 0.99,
-            eps: 1e-8,
-        };
+        let kind = OptimizerKind::Adam { beta1: 0.9, beta2: 0.99, eps: 1e-8 };
         let (mut optimizer, mut p) = (Optimizer::new(kind, 0.1, 1), [1.0]);
         optimizer.step(&mut p, &[0.5], 1.0);
         // Both corrections undo the first step's shares: p = 1 − 0.1 · 0.5 / 0.5.

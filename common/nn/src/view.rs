@@ -32,12 +32,7 @@ impl<'a> View<'a> {
     /// A dense matrix of this many columns.
     pub fn dense(data: &'a [f32], cols: usize) -> Self {
         debug_assert_eq!(data.len() % cols.max(1), 0, "whole rows");
-        Self {
-            data,
-            rows: data.len() / cols.max(1),
-            cols,
-            stride: cols,
-        }
+        Self { data, rows: data.len() / cols.max(1), cols, stride: cols }
     }
 
     /// One row.
@@ -48,21 +43,13 @@ impl<'a> View<'a> {
     /// A range of rows.
     pub fn rows(self, rows: Range<usize>) -> Self {
         let data = &self.data[(rows.start * self.stride).min(self.data.len())..];
-        Self {
-            data,
-            rows: rows.len(),
-            ..self
-        }
+        Self { data, rows: rows.len(), ..self }
     }
 
     /// A range of columns.
     pub fn columns(self, columns: Range<usize>) -> Self {
         debug_assert!(columns.end <= self.cols);
-        Self {
-            data: &self.data[columns.start.min(self.data.len())..],
-            cols: columns.len(),
-            ..self
-        }
+        Self { data: &self.data[columns.start.min(self.data.len())..], cols: columns.len(), ..self }
     }
 }
 
@@ -70,32 +57,17 @@ impl<'a> ViewMut<'a> {
     /// A dense matrix of this many columns.
     pub fn dense(data: &'a mut [f32], cols: usize) -> Self {
         debug_assert_eq!(data.len() % cols.max(1), 0, "whole rows");
-        Self {
-            rows: data.len() / cols.max(1),
-            data,
-            cols,
-            stride: cols,
-        }
+        Self { rows: data.len() / cols.max(1), data, cols, stride: cols }
     }
 
     /// The same matrix for reading.
     pub fn as_view(&self) -> View<'_> {
-        View {
-            data: self.data,
-            rows: self.rows,
-            cols: self.cols,
-            stride: self.stride,
-        }
+        View { data: self.data, rows: self.rows, cols: self.cols, stride: self.stride }
     }
 
     /// A shorter borrow of the same matrix.
     pub fn reborrow(&mut self) -> ViewMut<'_> {
-        ViewMut {
-            data: self.data,
-            rows: self.rows,
-            cols: self.cols,
-            stride: self.stride,
-        }
+        ViewMut { data: self.data, rows: self.rows, cols: self.cols, stride: self.stride }
     }
 
     /// One row.
@@ -106,24 +78,14 @@ impl<'a> ViewMut<'a> {
     /// A range of rows.
     pub fn rows(self, rows: Range<usize>) -> Self {
         let start = (rows.start * self.stride).min(self.data.len());
-        Self {
-            data: &mut self.data[start..],
-            rows: rows.len(),
-            cols: self.cols,
-            stride: self.stride,
-        }
+        Self { data: &mut self.data[start..], rows: rows.len(), cols: self.cols, stride: self.stride }
     }
 
     /// A range of columns.
     pub fn columns(self, columns: Range<usize>) -> Self {
         debug_assert!(columns.end <= self.cols);
         let start = columns.start.min(self.data.len());
-        Self {
-            data: &mut self.data[start..],
-            rows: self.rows,
-            cols: columns.len(),
-            stride: self.stride,
-        }
+        Self { data: &mut self.data[start..], rows: self.rows, cols: columns.len(), stride: self.stride }
     }
 }
 

@@ -2,13 +2,7 @@ use super::*;
 use crate::{EpisodeBuilder, Observation, RunSeed, Stream};
 use proptest::prelude::*;
 
-const DIMS: Dims = Dims {
-    entity_dim: 5,
-    n_actions: 3,
-    agents_max: 4,
-    entities_max: 7,
-    steps_max: 6,
-};
+const DIMS: Dims = Dims { entity_dim: 5, n_actions: 3, agents_max: 4, entities_max: 7, steps_max: 6 };
 const RUN: RunId = *b"a run's sixteen.";
 
 fn expected() -> Expected {
@@ -27,16 +21,10 @@ fn episode(task: usize, steps: usize, seed: u64) -> Episode {
     let observe = |rng: &mut crate::Rng| {
         let mut observation = Observation::new(n_agents, n_entities, DIMS.entity_dim, DIMS.n_actions);
         for entity in 0..n_entities {
-            observation
-                .entity_mut(entity)
-                .iter_mut()
-                .for_each(|x| *x = rng.random_range(-2.0..2.0));
+            observation.entity_mut(entity).iter_mut().for_each(|x| *x = rng.random_range(-2.0..2.0));
         }
         for agent in 0..n_agents {
-            observation
-                .observable_mut(agent)
-                .iter_mut()
-                .for_each(|seen| *seen = rng.random_range(0..=1));
+            observation.observable_mut(agent).iter_mut().for_each(|seen| *seen = rng.random_range(0..=1));
             observation.available_mut(agent).fill(1);
         }
         observation
@@ -44,19 +32,11 @@ fn episode(task: usize, steps: usize, seed: u64) -> Episode {
     let order = decision_order::draw(n_agents, rng);
     let mut builder = EpisodeBuilder::new(seed, seed / 2, task, order, &observe(rng));
     for _ in 0..steps {
-        let actions: Vec<u8> = (0..n_agents)
-            .map(|_| rng.random_range(0..DIMS.n_actions) as u8)
-            .collect();
+        let actions: Vec<u8> = (0..n_agents).map(|_| rng.random_range(0..DIMS.n_actions) as u8).collect();
         builder.step(&actions, rng.random_range(-1.0..1.0), &observe(rng));
     }
-    builder.finish(
-        if seed.is_multiple_of(2) {
-            End::Terminated
-        } else {
-            End::Truncated
-        },
-        seed.is_multiple_of(3),
-    )
+    builder
+        .finish(if seed.is_multiple_of(2) { End::Terminated } else { End::Truncated }, seed.is_multiple_of(3))
 }
 
 fn frame(episode: &Episode) -> Frame {
@@ -120,14 +100,8 @@ fn rows_lie_where_the_layout_says() {
         f32::from_le_bytes(frame.payload[at..at + 4].try_into().unwrap())
     };
     let d = DIMS.entity_dim;
-    assert_eq!(
-        [0, 1, 4, 5].map(|row| feature(0, row)),
-        [0, 1, 2, 3].map(|row| sent.entities[row * d])
-    );
-    assert_eq!(
-        [0, 1, 4, 5].map(|row| feature(1, row)),
-        [4, 5, 6, 7].map(|row| sent.entities[row * d])
-    );
+    assert_eq!([0, 1, 4, 5].map(|row| feature(0, row)), [0, 1, 2, 3].map(|row| sent.entities[row * d]));
+    assert_eq!([0, 1, 4, 5].map(|row| feature(1, row)), [4, 5, 6, 7].map(|row| sent.entities[row * d]));
     assert_eq!([2, 3, 6].map(|row| feature(0, row)), [0.0; 3]);
     assert_eq!(frame.payload.len() % ALIGNMENT, 0);
 }
@@ -157,15 +131,9 @@ fn each_fault_has_its_name() {
         ("flag", altered(|header, _| header.won = 2)),
         ("flag", altered(|header, _| header.reserved[5] = 1)),
         ("flag", altered(|_, payload| payload[layout.observable] = 2)),
-        (
-            "decision_order",
-            altered(|_, payload| payload[layout.decision_order] = 2),
-        ),
+        ("decision_order", altered(|_, payload| payload[layout.decision_order] = 2)),
         ("action", altered(|_, payload| payload[layout.actions] = 3)),
-        (
-            "not_finite",
-            altered(|_, payload| payload[..4].copy_from_slice(&f32::NAN.to_le_bytes())),
-        ),
+        ("not_finite", altered(|_, payload| payload[..4].copy_from_slice(&f32::NAN.to_le_bytes()))),
         (
             "action",
             altered(|_, payload| {
@@ -180,12 +148,6 @@ fn each_fault_has_its_name() {
     let good = frame(&episode(0, 6, 1));
     let short = decode(&good.header, &good.payload[..8], &expected());
     assert_eq!(reason(short), Err("length"));
-    let broken = Header {
-        checksum: !good.header.checksum,
-        ..good.header
-    };
-    assert_eq!(
-        reason(decode(&broken, &good.payload, &expected())),
-        Err("checksum")
-    );
+    let broken = Header { checksum: !good.header.checksum, ..good.header };
+    assert_eq!(reason(decode(&broken, &good.payload, &expected())), Err("checksum"));
 }

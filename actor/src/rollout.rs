@@ -1,0 +1,118 @@
+//! The rollout thread: a lease in, its episodes into shared memory.
+
+use crate::weights::Weights;
+use rit_algo::{Acting, Rit};
+use rit_config::{Config, RunDir};
+use rit_env::{
+    Split,
+    rollout::{Job, Rollout},
+};
+use rit_episode::wire::{self, EncodeError, Frame, PayloadLayout, RunId};
+use rit_ipc::{EpisodeSender, SendError};
+use rit_proto::v1::{Lease, Snapshot};
+use std::sync::{
+    Arc,
+    atomic::{AtomicBool, Ordering},
+};
+use tokio::{runtime::Handle, sync::mpsc};
+
+/// Why rolling ended.
+#[derive(Debug, thiserror::Error)]
+pub enum RolloutError {
+    /// The weights a lease asks for cannot be had.
+    #[error("no weights from the learner: {0}")]
+    Weights(#[from] tonic::Status),
+    /// Weights of another model.
+    #[error(
+        "the learner sent {found} acting parameters, this actor's model has {expected}; use one build and one configuration"
+    )]
+    OtherModel {
+        /// Parameters that came.
+        found: usize,
+        /// Parameters of the model.
+        expected: usize,
+    },
+    /// An episode that does not fit the run's dims.
+    #[error(transparent)]
+    Encode(#[from] EncodeError),
+    /// A frame that could not be sent.
+    #[error(transparent)]
+    Send(#[from] SendError),
+}
+
+/// What the rollout thread works with.
+pub(crate) struct Roller {
+    pub(crate) rit: Arc<Rit>,
+    pub(crate) rollout: Rollout,
+    pub(crate) sender: EpisodeSender,
+    pub(crate) layout: PayloadLayout,
+    pub(crate) run_id: RunId,
+    pub(crate) actor: u32,
+    pub(crate) weights: Weights,
+    /// Set when the actor shall end: a blocked send is given up.
+    pub(crate) stop: Arc<AtomicBool>,
+}
+
+impl Roller {
+    /// A rollout of the run's training tasks.
+    pub(crate) fn rollout(config: &Config) -> Rollout {
+        let tasks = config.environment.task_set.tasks(Split::Training);
+        let options = config.environment_options();
+        Rollout::new(tasks, options, config.seed, config.algorithm.random_permutation)
+    }
+
+    /// Where the run's shared memory lies.
+    pub(crate) fn space(run_dir: &RunDir) -> Result<rit_ipc::RunSpace, rit_ipc::RunSpaceError> {
+        rit_ipc::RunSpace::new(&run_dir.shared_memory_root())
+    }
+
+    /// Rolls leases until there are no more; says which are `done`.
+    pub(crate) fn run(
+        mut self,
+        runtime: &Handle,
+        mut leases: mpsc::Receiver<Lease>,
+        done: &mpsc::Sender<u64>,
+    ) -> Result<(), RolloutError> {
+        let mut frame = Frame::new(&self.layout);
+        let mut acting: Option<(u64, Acting)> = None;
+        while let Some(lease) = leases.blocking_recv() {
+            let version = lease.weights_version;
+            let acting = match &mut acting {
+                Some((held, acting)) => {
+                    if *held != version {
+                        acting.set_params(&self.params(runtime, version)?);
+                        *held = version;
+                    }
+                    acting
+                }
+                None => {
+                    let params = self.params(runtime, version)?;
+                    &mut acting.insert((version, Acting::new(Arc::clone(&self.rit), &params))).1
+                }
+            };
+            let jobs: Vec<Job> = lease
+                .episodes
+                .iter()
+                .map(|&number| Job { number, weights_version: version, epsilon: lease.epsilon, task: None })
+                .collect();
+            for episode in self.rollout.roll(acting, &jobs) {
+                wire::encode(&episode, &self.layout, self.run_id, self.actor, &mut frame)?;
+                self.sender.send(&frame, &|| self.stop.load(Ordering::Relaxed))?;
+            }
+            if done.blocking_send(lease.lease).is_err() {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    fn params(&mut self, runtime: &Handle, version: u64) -> Result<Vec<f32>, RolloutError> {
+        let Snapshot { params, .. } = &*runtime.block_on(self.weights.get(version))?;
+        let (words, rest) = params.as_chunks::<4>();
+        let expected = self.rit.acting().len();
+        if words.len() != expected || !rest.is_empty() {
+            return Err(RolloutError::OtherModel { found: words.len(), expected });
+        }
+        Ok(words.iter().map(|&word| f32::from_le_bytes(word)).collect())
+    }
+}

@@ -1,0 +1,267 @@
+//! The resolved configuration: complete, and within its limits. `presets/all.toml` says what each key means.
+
+use rit_algo::{Mixing, RitConfig, TaskRepresentations, UpdateConfig};
+use rit_env::{EnvironmentOptions, TaskSet};
+use rit_episode::RunSeed;
+use rit_nn::OptimizerKind;
+use serde::{Deserialize, Serialize};
+
+/// Everything a run is made from.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs, reason = "presets/all.toml documents every key, for users too")]
+pub struct Config {
+    pub seed: RunSeed,
+    pub environment: Environment,
+    pub algorithm: Algorithm,
+    pub network: Network,
+    pub training: Training,
+    pub evaluation: Evaluation,
+    pub actors: Actors,
+    pub learner: Learner,
+}
+
+/// `[environment]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs, reason = "presets/all.toml documents every key, for users too")]
+pub struct Environment {
+    pub task_set: TaskSet,
+    pub view_radius: f32,
+}
+
+/// `[algorithm]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs, reason = "presets/all.toml documents every key, for users too")]
+pub struct Algorithm {
+    pub mixing: MixingKind,
+    pub task_representations: bool,
+    pub random_permutation: bool,
+    pub gamma: f32,
+    pub optimizer: OptimizerName,
+    pub lr: f32,
+    pub rmsprop_alpha: f32,
+    pub optimizer_eps: f32,
+    pub grad_norm_clip: f64,
+    pub epsilon_start: f64,
+    pub epsilon_finish: f64,
+    pub epsilon_anneal_steps: u64,
+    pub n_rollout_threads: usize,
+    pub buffer_size: usize,
+    pub batch_size: usize,
+    pub target_update_interval: u64,
+    pub policy_lag: usize,
+}
+
+/// How utilities become Q_total.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum MixingKind {
+    /// The mixing network.
+    Network,
+    /// Their sum: RIT-VDN.
+    Sum,
+}
+
+/// Which optimiser.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum OptimizerName {
+    /// RMSprop.
+    RmsProp,
+    /// Adam.
+    Adam,
+}
+
+/// `[network]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs, reason = "presets/all.toml documents every key, for users too")]
+pub struct Network {
+    pub hidden_dim: usize,
+    pub attention_dim: usize,
+    pub n_heads: usize,
+    pub task_representation_dim: usize,
+    pub reward_embed_dim: usize,
+    pub mixing_embed_dim: usize,
+    pub hypernet_embed_dim: usize,
+}
+
+/// `[training]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs, reason = "presets/all.toml documents every key, for users too")]
+pub struct Training {
+    pub t_max: u64,
+    pub until: Until,
+}
+
+/// What ends a run before T_max: every training task of an evaluation has reached it.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum Until {
+    /// Nothing does.
+    Never,
+    /// A share of episodes won.
+    WinRate(f64),
+    /// A mean return.
+    MeanReturn(f64),
+}
+
+impl TryFrom<String> for Until {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        let error = || format!("training.until = {text:?}; write win_rate=NUMBER or mean_return=NUMBER");
+        if text.is_empty() {
+            return Ok(Self::Never);
+        }
+        let (metric, value) = text.split_once('=').ok_or_else(error)?;
+        let value: f64 = value.trim().parse().map_err(|_| error())?;
+        match metric.trim() {
+            "win_rate" if (0.0..=1.0).contains(&value) => Ok(Self::WinRate(value)),
+            "mean_return" if value.is_finite() => Ok(Self::MeanReturn(value)),
+            _ => Err(error()),
+        }
+    }
+}
+
+impl From<Until> for String {
+    fn from(until: Until) -> Self {
+        match until {
+            Until::Never => Self::new(),
+            Until::WinRate(value) => format!("win_rate={value}"),
+            Until::MeanReturn(value) => format!("mean_return={value}"),
+        }
+    }
+}
+
+/// `[evaluation]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs, reason = "presets/all.toml documents every key, for users too")]
+pub struct Evaluation {
+    pub every_env_steps: u64,
+    pub episodes: usize,
+    pub testing_episodes: usize,
+}
+
+/// `[actors]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs, reason = "presets/all.toml documents every key, for users too")]
+pub struct Actors {
+    pub count: usize,
+    pub episodes_at_once: usize,
+}
+
+/// `[learner]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs, reason = "presets/all.toml documents every key, for users too")]
+pub struct Learner {
+    pub listen: String,
+    pub shards: usize,
+    pub threads: usize,
+    pub metrics_every_env_steps: u64,
+}
+
+impl Config {
+    /// The model's sizes and parts.
+    pub fn rit(&self) -> RitConfig {
+        let (dims, network) = (self.environment.task_set.dims(), &self.network);
+        RitConfig {
+            entity_dim: dims.entity_dim,
+            n_actions: dims.n_actions,
+            hidden_dim: network.hidden_dim,
+            attention_dim: network.attention_dim,
+            n_heads: network.n_heads,
+            task_representations: self.algorithm.task_representations.then_some(TaskRepresentations {
+                dim: network.task_representation_dim,
+                reward_embed_dim: network.reward_embed_dim,
+            }),
+            mixing: match self.algorithm.mixing {
+                MixingKind::Network => Mixing::Network {
+                    mixing_embed_dim: network.mixing_embed_dim,
+                    hypernet_embed_dim: network.hypernet_embed_dim,
+                },
+                MixingKind::Sum => Mixing::Sum,
+            },
+        }
+    }
+
+    /// The update's constants.
+    pub fn update(&self) -> UpdateConfig {
+        let algorithm = &self.algorithm;
+        UpdateConfig {
+            gamma: algorithm.gamma,
+            lr: algorithm.lr,
+            optimizer: match algorithm.optimizer {
+                OptimizerName::RmsProp => {
+                    OptimizerKind::RmsProp { alpha: algorithm.rmsprop_alpha, eps: algorithm.optimizer_eps }
+                }
+                OptimizerName::Adam => {
+                    OptimizerKind::Adam { beta1: 0.9, beta2: 0.999, eps: algorithm.optimizer_eps }
+                }
+            },
+            grad_norm_clip: algorithm.grad_norm_clip,
+            shards: self.learner.shards,
+            threads: self.learner.threads,
+        }
+    }
+
+    /// How the environments differ from what their task says.
+    pub fn environment_options(&self) -> EnvironmentOptions {
+        let radius = self.environment.view_radius;
+        EnvironmentOptions { view_radius: radius.is_finite().then_some(radius) }
+    }
+
+    /// ε after so many collected environment steps.
+    pub fn epsilon(&self, env_steps: u64) -> f32 {
+        let Algorithm { epsilon_start, epsilon_finish, epsilon_anneal_steps, .. } = self.algorithm;
+        let progress = (env_steps as f64 / epsilon_anneal_steps.max(1) as f64).min(1.0);
+        (epsilon_start + (epsilon_finish - epsilon_start) * progress) as f32
+    }
+
+    /// Every number's name, value, smallest and largest.
+    pub(crate) fn limits(&self) -> Vec<(&'static str, f64, f64, f64)> {
+        let (algorithm, network, evaluation) = (&self.algorithm, &self.network, &self.evaluation);
+        // Beyond what anybody runs; they keep a slip of the keyboard from taking all memory.
+        const COUNT: f64 = 1e6;
+        const STEPS: f64 = 1e12;
+        const SIZE: f64 = 4096.0;
+        vec![
+            ("environment.view_radius", self.environment.view_radius.into(), 0.0, f64::INFINITY),
+            ("algorithm.gamma", algorithm.gamma.into(), 0.0, 1.0),
+            ("algorithm.lr", algorithm.lr.into(), 1e-12, 1.0),
+            ("algorithm.rmsprop_alpha", algorithm.rmsprop_alpha.into(), 0.0, 1.0),
+            ("algorithm.optimizer_eps", algorithm.optimizer_eps.into(), 1e-12, 1.0),
+            ("algorithm.grad_norm_clip", algorithm.grad_norm_clip, 1e-6, f64::INFINITY),
+            ("algorithm.epsilon_start", algorithm.epsilon_start, 0.0, 1.0),
+            ("algorithm.epsilon_finish", algorithm.epsilon_finish, 0.0, 1.0),
+            ("algorithm.epsilon_anneal_steps", algorithm.epsilon_anneal_steps as f64, 1.0, STEPS),
+            ("algorithm.n_rollout_threads", algorithm.n_rollout_threads as f64, 1.0, 4096.0),
+            ("algorithm.buffer_size", algorithm.buffer_size as f64, 1.0, COUNT),
+            ("algorithm.batch_size", algorithm.batch_size as f64, 1.0, algorithm.buffer_size as f64),
+            ("algorithm.target_update_interval", algorithm.target_update_interval as f64, 1.0, STEPS),
+            ("algorithm.policy_lag", algorithm.policy_lag as f64, 0.0, 64.0),
+            ("network.hidden_dim", network.hidden_dim as f64, 1.0, SIZE),
+            ("network.attention_dim", network.attention_dim as f64, 1.0, SIZE),
+            ("network.n_heads", network.n_heads as f64, 1.0, 64.0),
+            ("network.task_representation_dim", network.task_representation_dim as f64, 1.0, SIZE),
+            ("network.reward_embed_dim", network.reward_embed_dim as f64, 1.0, SIZE),
+            ("network.mixing_embed_dim", network.mixing_embed_dim as f64, 1.0, SIZE),
+            ("network.hypernet_embed_dim", network.hypernet_embed_dim as f64, 1.0, SIZE),
+            ("training.t_max", self.training.t_max as f64, 1.0, STEPS),
+            ("evaluation.every_env_steps", evaluation.every_env_steps as f64, 1.0, STEPS),
+            ("evaluation.episodes", evaluation.episodes as f64, 1.0, COUNT),
+            ("evaluation.testing_episodes", evaluation.testing_episodes as f64, 1.0, COUNT),
+            ("actors.count", self.actors.count as f64, 0.0, 256.0),
+            ("actors.episodes_at_once", self.actors.episodes_at_once as f64, 1.0, 4096.0),
+            ("learner.shards", self.learner.shards as f64, 1.0, 256.0),
+            ("learner.threads", self.learner.threads as f64, 1.0, 256.0),
+            ("learner.metrics_every_env_steps", self.learner.metrics_every_env_steps as f64, 1.0, STEPS),
+        ]
+    }
+}

@@ -1,0 +1,285 @@
+//! From what a person typed to a [`Config`].
+
+use crate::Config;
+use rit_env::{TaskSet, UnknownName};
+use toml::{Table, Value};
+
+/// What is wrong with what was typed. Every message names the key and what would do.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ConfigError {
+    /// Not TOML.
+    #[error("{source_name} is not TOML: {reason}")]
+    Syntax {
+        /// The file or option.
+        source_name: String,
+        /// What the parser said, in one line.
+        reason: String,
+    },
+    /// No such key.
+    #[error("unknown key {key:?}{}", suggestion.as_ref().map_or(String::new(), |known| format!("; did you mean {known:?}?")))]
+    UnknownKey {
+        /// The key.
+        key: String,
+        /// The key that looks most like it.
+        suggestion: Option<String>,
+    },
+    /// A value of another kind.
+    #[error("{key} must be {expected}, not {found}")]
+    Kind {
+        /// The key.
+        key: String,
+        /// The kind it must have.
+        expected: &'static str,
+        /// The kind it has.
+        found: &'static str,
+    },
+    /// A number out of its range.
+    #[error("{key} = {value} is out of range {min}..={max}")]
+    Range {
+        /// The key.
+        key: &'static str,
+        /// Its value.
+        value: f64,
+        /// Its smallest.
+        min: f64,
+        /// Its largest.
+        max: f64,
+    },
+    /// A word that means nothing there.
+    #[error("{0}")]
+    Name(#[from] UnknownName),
+    /// An experiment that does not say what to train on.
+    #[error("the experiment names no environment.task_set; known: {known}")]
+    NoTaskSet {
+        /// Those there are.
+        known: String,
+    },
+    /// Values that cannot go together.
+    #[error("{0}")]
+    Model(#[from] rit_algo::ConfigError),
+    /// What is left for the deserialiser to find: a word that is none of its choices.
+    #[error("{0}")]
+    Value(String),
+}
+
+/// Resolves an experiment and what the command line sets, in ascending order of precedence.
+///
+/// # Errors
+/// The first thing found wrong.
+pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Result<Config, ConfigError> {
+    let defaults = parse(include_str!("presets/all.toml"), "presets/all.toml")?;
+    let mut typed = parse(experiment, source_name)?;
+    for setting in settings {
+        merge(&mut typed, setting.clone());
+    }
+    check_keys(&typed, &defaults, "")?;
+    let preset = match task_set(&typed)? {
+        TaskSet::MatrixGame => include_str!("presets/matrix.toml"),
+        TaskSet::CooperativeNavigation | TaskSet::PredatorPrey | TaskSet::PredatorPreyPro => {
+            include_str!("presets/mpe.toml")
+        }
+    };
+    let mut all = defaults;
+    merge(&mut all, parse(preset, "the task set's preset")?);
+    merge(&mut all, typed);
+    let config: Config =
+        all.try_into().map_err(|error: toml::de::Error| ConfigError::Value(one_line(&error)))?;
+    for (key, value, min, max) in config.limits() {
+        // Written so that a NaN is out of every range.
+        if !(min..=max).contains(&value) {
+            return Err(ConfigError::Range { key, value, min, max });
+        }
+    }
+    config.rit().validate()?;
+    Ok(config)
+}
+
+/// One `section.key=value` of the command line. A value that is no TOML is taken as a word.
+///
+/// # Errors
+/// When there is no `=` or no key.
+pub fn set(assignment: &str) -> Result<Table, ConfigError> {
+    let source_name = || format!("--set {assignment}");
+    let Some((key, value)) = assignment.split_once('=') else {
+        let reason = "write --set section.key=value".to_owned();
+        return Err(ConfigError::Syntax { source_name: source_name(), reason });
+    };
+    let (key, value) = (key.trim(), value.trim());
+    parse(&format!("{key} = {value}"), &source_name())
+        .or_else(|_| parse(&format!("{key} = {value:?}"), &source_name()))
+}
+
+fn parse(text: &str, source_name: &str) -> Result<Table, ConfigError> {
+    text.parse::<Table>().map_err(|error| ConfigError::Syntax {
+        source_name: source_name.to_owned(),
+        reason: one_line(&error),
+    })
+}
+
+fn one_line(error: &toml::de::Error) -> String {
+    error.message().lines().collect::<Vec<_>>().join("; ")
+}
+
+/// Puts `above` over `below`, table by table.
+fn merge(below: &mut Table, above: Table) {
+    for (key, value) in above {
+        match (below.get_mut(&key), value) {
+            (Some(Value::Table(below)), Value::Table(above)) => merge(below, above),
+            (_, value) => {
+                below.insert(key, value);
+            }
+        }
+    }
+}
+
+/// Every typed key must be one of the defaults', and of its kind.
+fn check_keys(typed: &Table, defaults: &Table, prefix: &str) -> Result<(), ConfigError> {
+    for (name, value) in typed {
+        let key = format!("{prefix}{name}");
+        let Some(default) = defaults.get(name) else {
+            return Err(ConfigError::UnknownKey { suggestion: closest(&key), key });
+        };
+        match (value, default) {
+            (Value::Table(value), Value::Table(default)) => check_keys(value, default, &format!("{key}."))?,
+            // A whole number will do for a real one.
+            (Value::Integer(_), Value::Float(_)) => {}
+            (Value::Integer(number), Value::Integer(_)) if *number < 0 => {
+                return Err(ConfigError::Kind {
+                    key,
+                    expected: "a whole number of at least 0",
+                    found: "a negative one",
+                });
+            }
+            _ if value.same_type(default) => {}
+            _ => return Err(ConfigError::Kind { key, expected: kind(default), found: kind(value) }),
+        }
+    }
+    Ok(())
+}
+
+fn kind(value: &Value) -> &'static str {
+    match value {
+        Value::String(_) => "a word in quotes",
+        Value::Integer(_) => "a whole number",
+        Value::Float(_) => "a number",
+        Value::Boolean(_) => "true or false",
+        Value::Datetime(_) => "a date",
+        Value::Array(_) => "a list",
+        Value::Table(_) => "a section",
+    }
+}
+
+/// The known key that looks most like this one, if any does.
+fn closest(key: &str) -> Option<String> {
+    let mut known = Vec::new();
+    if let Ok(defaults) = parse(include_str!("presets/all.toml"), "presets/all.toml") {
+        for (section, value) in &defaults {
+            known.push(section.clone());
+            if let Value::Table(keys) = value {
+                known.extend(keys.keys().map(|name| format!("{section}.{name}")));
+            }
+        }
+    }
+    // The last part alone is compared too: a key in the wrong section is a common slip.
+    let last = |key: &str| key.rsplit('.').next().map(str::to_owned).unwrap_or_default();
+    let likeness =
+        |known: &str| strsim::jaro_winkler(key, known).max(strsim::jaro_winkler(&last(key), &last(known)));
+    let best = known.into_iter().max_by(|a, b| likeness(a).total_cmp(&likeness(b)))?;
+    (likeness(&best) > 0.8).then_some(best)
+}
+
+fn task_set(typed: &Table) -> Result<TaskSet, ConfigError> {
+    let known = || TaskSet::ALL.map(|set| set.to_string()).join(", ");
+    let name = typed.get("environment").and_then(|section| section.get("task_set")).and_then(Value::as_str);
+    name.ok_or_else(|| ConfigError::NoTaskSet { known: known() })?.parse().map_err(ConfigError::Name)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{MixingKind, OptimizerName, Until};
+
+    const MATRIX: &str = "environment.task_set = \"matrix-game\"";
+
+    fn with(settings: &[&str]) -> Result<Config, ConfigError> {
+        let settings: Vec<Table> = settings.iter().map(|text| set(text).unwrap()).collect();
+        resolve(MATRIX, "test", &settings)
+    }
+
+    #[test]
+    fn table_ii_is_what_the_presets_say() {
+        let matrix = with(&[]).unwrap();
+        let algorithm = &matrix.algorithm;
+        assert_eq!((algorithm.batch_size, algorithm.buffer_size, algorithm.n_rollout_threads), (32, 5000, 1));
+        assert_eq!((algorithm.lr, algorithm.optimizer), (5e-4, OptimizerName::RmsProp));
+        assert_eq!((algorithm.rmsprop_alpha, algorithm.optimizer_eps), (0.99, 1e-5));
+        assert_eq!((matrix.training.t_max, matrix.network.task_representation_dim), (50_000, 32));
+        for name in ["cooperative-navigation", "predator-prey", "predator-prey-pro"] {
+            let mpe = resolve(&format!("environment.task_set = {name:?}"), "test", &[]).unwrap();
+            let algorithm = &mpe.algorithm;
+            assert_eq!(
+                (algorithm.batch_size, algorithm.buffer_size, algorithm.n_rollout_threads),
+                (64, 5000, 8)
+            );
+            assert_eq!(
+                (algorithm.lr, algorithm.optimizer, algorithm.optimizer_eps),
+                (1e-3, OptimizerName::Adam, 1e-8)
+            );
+            assert_eq!((mpe.training.t_max, mpe.network.task_representation_dim), (5_050_000, 20));
+            assert_eq!((algorithm.epsilon_anneal_steps, algorithm.target_update_interval), (50_000, 200));
+        }
+    }
+
+    #[test]
+    fn the_command_line_is_above_the_experiment() {
+        let config = with(&["algorithm.gamma=0.5", "algorithm.mixing=sum", "seed=9"]).unwrap();
+        assert_eq!((config.algorithm.gamma, config.algorithm.mixing), (0.5, MixingKind::Sum));
+        assert_eq!(config.seed.0, 9);
+        assert_eq!(with(&["training.until=win_rate=1.0"]).unwrap().training.until, Until::WinRate(1.0));
+        assert_eq!(with(&["algorithm.gamma=1", "algorithm.gamma=0"]).unwrap().algorithm.gamma, 0.0);
+    }
+
+    #[test]
+    fn what_is_written_leads_back() {
+        let config = with(&["environment.view_radius=inf", "algorithm.lr=0.25"]).unwrap();
+        let text = toml::to_string(&config).unwrap();
+        assert_eq!(resolve(&text, "config.toml", &[]), Ok(config));
+    }
+
+    #[test]
+    fn errors_name_the_key_and_the_remedy() {
+        let message = |settings: &[&str]| with(settings).unwrap_err().to_string();
+        assert_eq!(message(&["algorithm.gamma=7"]), "algorithm.gamma = 7 is out of range 0..=1");
+        assert_eq!(message(&["algorithm.gamma=nan"]), "algorithm.gamma = NaN is out of range 0..=1");
+        assert_eq!(
+            message(&["algorithm.gama=0.9"]),
+            "unknown key \"algorithm.gama\"; did you mean \"algorithm.gamma\"?"
+        );
+        assert_eq!(message(&["gamma=0.9"]), "unknown key \"gamma\"; did you mean \"algorithm.gamma\"?");
+        assert_eq!(message(&["zzz.qqq=1"]), "unknown key \"zzz\"");
+        assert_eq!(
+            message(&["algorithm.gamma=high"]),
+            "algorithm.gamma must be a number, not a word in quotes"
+        );
+        assert_eq!(
+            message(&["algorithm.batch_size=-1"]),
+            "algorithm.batch_size must be a whole number of at least 0, not a negative one"
+        );
+        assert_eq!(
+            message(&["algorithm.batch_size=6000"]),
+            "algorithm.batch_size = 6000 is out of range 1..=5000"
+        );
+        assert_eq!(message(&["network.n_heads=3"]), "attention_dim 64 is not a multiple of n_heads 3");
+        assert!(message(&["training.until=win_rate=2"]).contains("write win_rate=NUMBER"));
+        assert!(message(&["algorithm.mixing=vdn"]).contains("expected `network` or `sum`"));
+        assert!(
+            message(&["environment.task_set=chess"])
+                .contains("unknown task set \"chess\"; known: matrix-game")
+        );
+        assert!(resolve("", "test", &[]).unwrap_err().to_string().contains("names no environment.task_set"));
+        assert!(
+            resolve("a = = b", "my.toml", &[]).unwrap_err().to_string().starts_with("my.toml is not TOML: ")
+        );
+        assert!(set("algorithm.gamma").unwrap_err().to_string().contains("section.key=value"));
+    }
+}

@@ -1,0 +1,89 @@
+//! Cooperative navigation (paper, section VI-A): n agents cover n landmarks without running into each other.
+//! Original "simple spread" rewards, paid as their sum over agents.
+
+use super::world::{Body, DIRECTIONS, FEATURES, STEPS, World, squared_distance_to_nearest};
+use crate::{BodyKind, Environment, EnvironmentOptions, Scene, Step};
+use rit_episode::{Action, Observation, Rng};
+
+const AGENT: Body =
+    Body { collides: true, movable: true, acceleration: 5.0, ..Body::new(BodyKind::Agent, 0.15) };
+const LANDMARK: Body = Body::new(BodyKind::Landmark, 0.05);
+
+/// The task (n, n). Entities: the agents, then the landmarks.
+#[derive(Debug)]
+pub struct CooperativeNavigation {
+    world: World,
+}
+
+impl CooperativeNavigation {
+    /// The task of `n` agents and as many landmarks.
+    ///
+    /// # Panics
+    /// Without agents, or with a view radius that is negative or not a number.
+    pub fn new(n: usize, options: EnvironmentOptions) -> Self {
+        let bodies = [vec![AGENT; n], vec![LANDMARK; n]].concat();
+        Self { world: World::new(bodies, n, options) }
+    }
+
+    /// The sum over agents of −(Σ_landmarks distance of the nearest agent) − (number of agents it overlaps,
+    /// itself included as in the original).
+    fn team_reward(&self) -> f32 {
+        let (agents, landmarks) = self.world.bodies.split_at(self.world.n_agents());
+        let mut uncovered = 0.0;
+        for landmark in landmarks {
+            let places = agents.iter().map(|agent| agent.position);
+            uncovered += squared_distance_to_nearest(landmark.position, places).sqrt();
+        }
+        // Each agent overlaps itself; two agents that overlap count each other.
+        let mut overlaps = agents.len();
+        for (index, agent) in agents.iter().enumerate() {
+            overlaps += 2 * agents[..index].iter().filter(|other| agent.overlaps(other)).count();
+        }
+        -(agents.len() as f32 * uncovered + overlaps as f32)
+    }
+}
+
+impl Environment for CooperativeNavigation {
+    fn n_agents(&self) -> usize {
+        self.world.n_agents()
+    }
+
+    fn n_entities(&self) -> usize {
+        self.world.n_entities()
+    }
+
+    /// Position (2), velocity (2), the kind's one-hot (3).
+    fn feature_dim(&self) -> usize {
+        FEATURES
+    }
+
+    /// None, −x, +x, −y, +y.
+    fn n_actions(&self) -> usize {
+        DIRECTIONS.len()
+    }
+
+    fn steps_max(&self) -> usize {
+        STEPS
+    }
+
+    fn reset(&mut self, rng: &mut Rng) {
+        self.world.reset(rng);
+    }
+
+    fn observe(&self, observation: &mut Observation) {
+        self.world.observe(observation);
+    }
+
+    fn step(&mut self, actions: &[Action], _: &mut Rng) -> Step {
+        self.world.set_forces(actions);
+        let end = self.world.advance();
+        Step { reward: self.team_reward(), end, won: false }
+    }
+
+    fn scene(&self) -> Option<Scene> {
+        Some(self.world.scene())
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,141 @@
+//! What both ends share of iceoryx2: the node a process is known by, the service, and the removal of the dead.
+
+use crate::RunSpace;
+use iceoryx2::config::Config;
+use iceoryx2::node::{DeadNodeView, NodeView as _};
+use iceoryx2::prelude::*;
+use iceoryx2::service::builder::publish_subscribe::Builder;
+use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+use rit_episode::wire::{ALIGNMENT, Header};
+use std::fmt::Debug;
+use std::sync::Once;
+use std::time::Duration;
+
+/// The service as both ends have it.
+pub(crate) type Episodes = PortFactory<Service, [Word], HeaderWords>;
+
+/// Shared by threads, so that frames are `Send`.
+pub(crate) type Service = ipc_threadsafe::Service;
+
+/// A [`Header`] in a type that iceoryx2 knows to be plain.
+pub(crate) type HeaderWords = [u64; size_of::<Header>() / size_of::<u64>()];
+const _: () = assert!(size_of::<HeaderWords>() == size_of::<Header>());
+
+/// What a payload is made of. Not bytes: iceoryx2 gives every *element* the alignment asked for, and a slice of
+/// bytes aligned to 8 takes eight times its length.
+pub(crate) type Word = [u8; ALIGNMENT];
+
+/// The attribute of the service that holds the payload's length.
+pub(crate) const PAYLOAD_LEN: &str = "payload_len";
+
+const SERVICE: &str = "episodes";
+
+/// How long to wait for another process that is removing the same dead node.
+const REAP_PATIENCE: Duration = Duration::from_secs(1);
+
+/// Something in iceoryx2 that has no better name here.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{doing} failed, iceoryx2 says {reason}: run with IOX2_LOG_LEVEL=debug to see why")]
+pub struct IceoryxError {
+    doing: &'static str,
+    reason: String,
+}
+
+impl IceoryxError {
+    pub(crate) fn new(doing: &'static str, reason: impl Debug) -> Self {
+        Self { doing, reason: format!("{reason:?}") }
+    }
+}
+
+/// Whose node it is: the reaper tells them apart.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Role {
+    Learner,
+    Actor,
+}
+
+impl Role {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Learner => "learner",
+            Self::Actor => "actor",
+        }
+    }
+}
+
+pub(crate) fn create_node(space: &RunSpace, role: Role) -> Result<Node<Service>, IceoryxError> {
+    static LOG_LEVEL: Once = Once::new();
+    // Below that it tells of every dead process it meets.
+    LOG_LEVEL.call_once(|| set_log_level_from_env_or(LogLevel::Error));
+
+    let name = NodeName::new(role.name()).map_err(|error| IceoryxError::new("naming a node", error))?;
+    NodeBuilder::new()
+        .name(&name)
+        .config(space.config())
+        // Signals are tokio's.
+        .signal_handling_mode(SignalHandlingMode::Disabled)
+        .create()
+        .map_err(|error| IceoryxError::new("creating a node", error))
+}
+
+/// The service, to be created by the learner and opened by actors.
+pub(crate) fn service(node: &Node<Service>) -> Result<Builder<[Word], HeaderWords, Service>, IceoryxError> {
+    let name = ServiceName::new(SERVICE).map_err(|error| IceoryxError::new("naming the service", error))?;
+    let alignment =
+        Alignment::new(ALIGNMENT).ok_or_else(|| IceoryxError::new("aligning the payload", ALIGNMENT))?;
+    let service = node
+        .service_builder(&name)
+        .publish_subscribe::<[Word]>()
+        .user_header::<HeaderWords>()
+        .payload_alignment(alignment)
+        .enable_safe_overflow(false)
+        .history_size(0);
+    Ok(service)
+}
+
+/// What a reaper has done.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Reaped {
+    /// Dead processes whose places are free now.
+    pub removed: usize,
+    /// Dead processes whose places could not be freed. Try again.
+    pub left: usize,
+}
+
+/// Nodes of this run, and of this role if one is given, whose process is gone.
+///
+/// A dead node without details is left alone. It lost them while it was leaving or being reaped, after its places,
+/// and iceoryx2 would look for what remains of it in the global root.
+pub(crate) fn dead_nodes(
+    config: &Config,
+    role: Option<Role>,
+) -> Result<Vec<DeadNodeView<Service>>, IceoryxError> {
+    let mut dead = Vec::new();
+    Node::<Service>::list(config, |state| {
+        if let NodeState::Dead(node) = state
+            && let Some(details) = node.details()
+            && role.is_none_or(|role| details.name().as_str() == role.name())
+        {
+            dead.push(node);
+        }
+        CallbackProgression::Continue
+    })
+    .map_err(|error| IceoryxError::new("listing nodes", error))?;
+    Ok(dead)
+}
+
+/// Frees everything dead nodes held.
+pub(crate) fn remove(dead: Vec<DeadNodeView<Service>>) -> Reaped {
+    let mut reaped = Reaped::default();
+    for node in dead {
+        let id = *node.id();
+        match node.blocking_remove_stale_resources(REAP_PATIENCE) {
+            Ok(()) => reaped.removed += 1,
+            Err(error) => {
+                tracing::warn!(%id, ?error, "a dead process could not be cleaned up yet");
+                reaped.left += 1;
+            }
+        }
+    }
+    reaped
+}

@@ -1,0 +1,239 @@
+//! One run's own place: a directory, a prefix for what lies in /dev/shm, and an end to both.
+
+use crate::shared_memory;
+use iceoryx2::config::Config;
+use iceoryx2::prelude::{FileName, Path as IceoryxPath, SemanticString as _};
+use rustix::fs::{FlockOperation, Mode, OFlags};
+use rustix::io::Errno;
+use std::fs::DirBuilder;
+use std::io;
+use std::os::fd::OwnedFd;
+use std::os::unix::fs::{DirBuilderExt as _, MetadataExt as _};
+use std::path::{Path, PathBuf};
+
+/// Longest directory and prefix together. iceoryx2 appends a node's number, a port's and a suffix, and panics when
+/// that does not fit into 255 bytes.
+const LENGTH_LIMIT: usize = 100;
+
+/// What iceoryx2 makes in its root.
+const NODES: &str = "nodes";
+const SERVICES: &str = "services";
+
+/// Names one run's own place for shared memory. Whoever names the same directory is in the same run.
+#[derive(Clone, Debug)]
+pub struct RunSpace {
+    directory: PathBuf,
+    prefix: String,
+    config: Config,
+}
+
+/// A directory that cannot name a run's place.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum RunSpaceError {
+    /// Two processes may have different working directories.
+    #[error("the run directory {directory} is not absolute: give the whole path")]
+    NotAbsolute {
+        /// The directory.
+        directory: PathBuf,
+    },
+    /// Names made from it would not fit.
+    #[error(
+        "the run directory {directory} has {length} bytes where {limit} are allowed: choose a shorter one, like \
+         /tmp/rit-1000/1a2b3c4d"
+    )]
+    TooLong {
+        /// The directory.
+        directory: PathBuf,
+        /// Its length in bytes.
+        length: usize,
+        /// Most bytes.
+        limit: usize,
+    },
+    /// iceoryx2 takes no such path.
+    #[error("the run directory {directory} has characters that a name in shared memory cannot have")]
+    Characters {
+        /// The directory.
+        directory: PathBuf,
+    },
+}
+
+/// A run directory that cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum DirectoryError {
+    /// Not made, or not read.
+    #[error("the run directory {directory} cannot be used: {source}")]
+    Io {
+        /// The directory.
+        directory: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+    /// Somebody else may write there.
+    #[error("the run directory {directory} is not private: it has to be yours, with mode 700")]
+    NotPrivate {
+        /// The directory.
+        directory: PathBuf,
+    },
+}
+
+/// Something of the run is still there.
+#[derive(Debug, thiserror::Error)]
+pub enum RemoveError {
+    /// Nothing is removed from a directory that is not ours alone.
+    #[error(transparent)]
+    Directory(#[from] DirectoryError),
+    /// A file or directory would not go.
+    #[error("{path} of the finished run could not be removed: {source}")]
+    Io {
+        /// What is left.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+}
+
+impl RunSpace {
+    /// Names the place that belongs to a directory, such as `/tmp/rit-<uid>/<8 hex>`. Nothing is made yet.
+    ///
+    /// # Errors
+    /// When the path is relative, too long or of strange characters.
+    pub fn new(directory: &Path) -> Result<Self, RunSpaceError> {
+        // Without trailing and doubled slashes: the same directory has to give the same prefix.
+        let directory: PathBuf = directory.components().collect();
+        if !directory.is_absolute() {
+            return Err(RunSpaceError::NotAbsolute { directory });
+        }
+        let bytes = directory.as_os_str().as_encoded_bytes();
+        let prefix = format!("rit_{:016x}_", fnv1a(bytes));
+        let (length, limit) = (bytes.len(), LENGTH_LIMIT - prefix.len());
+        if length > limit {
+            return Err(RunSpaceError::TooLong { directory, length, limit });
+        }
+        let (Ok(root), Ok(file_prefix)) = (IceoryxPath::new(bytes), FileName::new(prefix.as_bytes())) else {
+            return Err(RunSpaceError::Characters { directory });
+        };
+
+        let mut config = Config::default();
+        config.global.set_root_path(&root);
+        config.global.prefix = file_prefix;
+        // Nobody is reaped in passing: see `EpisodeReceiver::reap_dead`.
+        config.global.node.cleanup_dead_nodes_on_creation = false;
+        config.global.node.cleanup_dead_nodes_on_destruction = false;
+        config.global.service.cleanup_dead_nodes_on_open = false;
+        Ok(Self { directory, prefix, config })
+    }
+
+    /// The directory.
+    pub fn directory(&self) -> &Path {
+        &self.directory
+    }
+
+    /// Everything of this run that exists, in /dev/shm and in its directory: nothing before, and nothing after
+    /// [`RunSpace::remove`].
+    ///
+    /// # Errors
+    /// When a directory cannot be read.
+    pub fn leftovers(&self) -> io::Result<Vec<PathBuf>> {
+        let mut found = shared_memory::segments(&self.prefix)?;
+        let ours = [NODES, SERVICES].map(|name| self.directory.join(name));
+        for path in ours.into_iter().chain([self.directory.clone()]) {
+            if path.try_exists()? {
+                found.push(path);
+            }
+        }
+        Ok(found)
+    }
+
+    /// Removes everything the run has left, however its processes ended. Only for when all have ended. The
+    /// directory itself stays if something else lies in it.
+    ///
+    /// # Errors
+    /// With the first thing that would not go, after all have been tried.
+    pub fn remove(&self) -> Result<(), RemoveError> {
+        match self.check_directory() {
+            Err(DirectoryError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {}
+            outcome => outcome?,
+        }
+        let at = |path: &Path| {
+            let path = path.to_path_buf();
+            move |source| RemoveError::Io { path, source }
+        };
+        let mut outcome = Ok(());
+        for path in self.leftovers().map_err(at(&self.directory))? {
+            let removed = if path == self.directory {
+                std::fs::remove_dir(&path)
+            } else if path.starts_with(&self.directory) {
+                std::fs::remove_dir_all(&path)
+            } else {
+                std::fs::remove_file(&path)
+            };
+            match removed {
+                Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+                Err(error) if error.kind() == io::ErrorKind::DirectoryNotEmpty && path == self.directory => {}
+                removed => outcome = outcome.and(removed.map_err(at(&path))),
+            }
+        }
+        outcome
+    }
+
+    pub(crate) fn config(&self) -> &Config {
+        &self.config
+    }
+
+    /// What every file of the run in /dev/shm begins with.
+    pub(crate) fn prefix(&self) -> &str {
+        &self.prefix
+    }
+
+    /// A file of the run in /dev/shm.
+    pub(crate) fn segment(&self, name: &str) -> PathBuf {
+        Path::new(shared_memory::DIRECTORY).join(format!("{}{name}", self.prefix))
+    }
+
+    /// Makes the directory, for this user only, or finds it like that.
+    pub(crate) fn make_directory(&self) -> Result<(), DirectoryError> {
+        let made = DirBuilder::new().recursive(true).mode(0o700).create(&self.directory);
+        made.map_err(|source| self.directory_error(source))?;
+        self.check_directory()
+    }
+
+    /// Whether the directory is there and nobody else's.
+    pub(crate) fn check_directory(&self) -> Result<(), DirectoryError> {
+        let metadata = std::fs::symlink_metadata(&self.directory);
+        let metadata = metadata.map_err(|source| self.directory_error(source))?;
+        let ours = metadata.uid() == rustix::process::geteuid().as_raw();
+        if metadata.is_dir() && ours && metadata.mode() & 0o077 == 0 {
+            return Ok(());
+        }
+        Err(DirectoryError::NotPrivate { directory: self.directory.clone() })
+    }
+
+    /// Takes the learner's lock, which ends with the process however it ends. Nothing if another learner has it.
+    pub(crate) fn lock(&self) -> Result<Option<OwnedFd>, DirectoryError> {
+        let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
+        let failed = |error: Errno| self.directory_error(error.into());
+        let directory = rustix::fs::open(&self.directory, flags, Mode::empty()).map_err(failed)?;
+        match rustix::fs::flock(&directory, FlockOperation::NonBlockingLockExclusive) {
+            Ok(()) => Ok(Some(directory)),
+            Err(Errno::WOULDBLOCK) => Ok(None),
+            Err(error) => Err(failed(error)),
+        }
+    }
+
+    /// Forgets every service. Only under the lock.
+    pub(crate) fn remove_services(&self) -> Result<(), DirectoryError> {
+        let removed = std::fs::remove_dir_all(self.directory.join(SERVICES));
+        removed.map_err(|source| self.directory_error(source))
+    }
+
+    fn directory_error(&self, source: io::Error) -> DirectoryError {
+        DirectoryError::Io { directory: self.directory.clone(), source }
+    }
+}
+
+/// FNV-1a, 64 bits: the same on every side and in every build, which the standard library's hash does not promise.
+fn fnv1a(bytes: &[u8]) -> u64 {
+    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, &byte| {
+        (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
+    })
+}

@@ -1,0 +1,151 @@
+//! What can be typed.
+
+use crate::logging::LogOptions;
+use clap::{Args, Parser, Subcommand};
+use std::path::PathBuf;
+
+/// Multi-task multi-agent reinforcement learning with interaction and task representations.
+#[derive(Debug, Parser)]
+#[command(version, propagate_version = true)]
+pub struct Cli {
+    #[command(subcommand)]
+    pub command: Command,
+    #[command(flatten)]
+    pub logs: LogOptions,
+}
+
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Start a learner and its actors, and watch over them until training is done
+    Train(TrainOptions),
+    /// Start a learner alone; actors join it
+    Learner(LearnerOptions),
+    /// Start one actor; it joins the learner of a run directory
+    Actor(ActorOptions),
+    /// Roll greedy episodes with a run's newest checkpoint
+    Evaluate(EvaluateOptions),
+    /// Ask something of a running learner
+    Ctl(CtlOptions),
+    /// List the experiments that come with the program
+    Experiments,
+}
+
+/// What makes a run's configuration.
+#[derive(Args, Debug)]
+pub struct ConfigOptions {
+    /// Name of an experiment (see `rit experiments`) or path of a TOML file
+    pub experiment: String,
+    /// The run's seed: the same seed gives the same weights
+    #[arg(long, value_name = "N")]
+    pub seed: Option<u64>,
+    /// Actor processes
+    #[arg(long, value_name = "N")]
+    pub actors: Option<u32>,
+    /// Environment steps to collect, `training.t_max`
+    #[arg(long, value_name = "N")]
+    pub steps: Option<u64>,
+    /// End at the first evaluation where every training task has reached this, such as win_rate=1.0
+    #[arg(long, value_name = "METRIC=VALUE")]
+    pub until: Option<String>,
+    /// Set any key, such as algorithm.gamma=0.95; may be given again and again
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub settings: Vec<String>,
+    /// Directory of the new run; without it a fresh one under runs/
+    #[arg(long, value_name = "DIR")]
+    pub run_dir: Option<PathBuf>,
+}
+
+#[derive(Args, Debug)]
+pub struct TrainOptions {
+    #[command(flatten)]
+    pub config: ConfigOptions,
+    /// Print the summary as JSON, and no progress
+    #[arg(long)]
+    pub json: bool,
+}
+
+#[derive(Args, Debug)]
+pub struct LearnerOptions {
+    /// Run directory that `rit train` or `rit learner --new` has made
+    #[arg(long, value_name = "DIR")]
+    pub run_dir: PathBuf,
+    /// Make the run directory first, for this experiment or TOML file
+    #[arg(long, value_name = "EXPERIMENT")]
+    pub new: Option<String>,
+    /// Set any key of a new run; may be given again and again
+    #[arg(long = "set", value_name = "KEY=VALUE", requires = "new")]
+    pub settings: Vec<String>,
+    /// Stop when standard input ends: whoever started this process has gone
+    #[arg(long, hide = true)]
+    pub supervised: bool,
+}
+
+#[derive(Args, Debug)]
+pub struct ActorOptions {
+    /// Run directory of the learner
+    #[arg(long, value_name = "DIR")]
+    pub run_dir: PathBuf,
+    /// Name of this actor, unique in its run
+    #[arg(long, default_value = "actor-0")]
+    pub name: String,
+    /// Stop when standard input ends: whoever started this process has gone
+    #[arg(long, hide = true)]
+    pub supervised: bool,
+}
+
+#[derive(Args, Debug)]
+pub struct EvaluateOptions {
+    /// Run directory
+    #[arg(long, value_name = "DIR")]
+    pub run: PathBuf,
+    /// training, testing, or names of tasks
+    #[arg(long, value_delimiter = ',', default_value = "training")]
+    pub tasks: Vec<String>,
+    /// Episodes of each task; without it the run's own number
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub episodes: Option<u32>,
+    /// Seed of the evaluation; without it one that follows from the run's
+    #[arg(long)]
+    pub seed: Option<u64>,
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+#[derive(Args, Debug)]
+pub struct CtlOptions {
+    /// Run directory
+    #[arg(long, value_name = "DIR", global = true)]
+    pub run: Option<PathBuf>,
+    /// Print JSON
+    #[arg(long, global = true)]
+    pub json: bool,
+    #[command(subcommand)]
+    pub command: CtlCommand,
+}
+
+#[derive(Debug, Subcommand)]
+pub enum CtlCommand {
+    /// How the run stands
+    Status,
+    /// Hand out no further episode
+    Pause,
+    /// Hand out episodes again
+    Resume,
+    /// Roll greedy episodes with the present weights, while training goes on
+    Evaluate {
+        /// training, testing, or names of tasks
+        #[arg(long, value_delimiter = ',', default_value = "training")]
+        tasks: Vec<String>,
+        /// Episodes of each task; without it the run's own number
+        #[arg(long, value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+        episodes: Option<u32>,
+        /// Seed of the evaluation; without it one that follows from the run's
+        #[arg(long)]
+        seed: Option<u64>,
+    },
+    /// Write a checkpoint now
+    Checkpoint,
+    /// End the run: checkpoint, summary, farewell
+    Stop,
+}

@@ -1,0 +1,114 @@
+//! `rit ctl`: asks something of a running learner.
+
+use crate::{
+    cli::{CtlCommand, CtlOptions},
+    failure::Failure,
+    report,
+};
+use rit_config::RunDir;
+use rit_proto::{
+    transport,
+    v1::{
+        CheckpointRequest, EvaluateRequest, Evaluation, PauseRequest, ResumeRequest, RunStatus,
+        StatusRequest, StopRequest, control_client::ControlClient,
+    },
+};
+use std::{fs, process::ExitCode};
+
+/// `rit ctl`.
+#[allow(clippy::print_stdout, reason = "what the command is for")]
+pub async fn run(options: CtlOptions) -> Result<ExitCode, Failure> {
+    let Some(run) = &options.run else {
+        return Err(Failure::input_message("which run? give --run DIR"));
+    };
+    let (run_dir, _) = RunDir::open(run)?;
+    let address = fs::read_to_string(run_dir.address()).map_err(|_| {
+        let root = run_dir.root().display();
+        Failure::runtime_message(format!(
+            "no learner runs for {root}; start it with `rit learner --run-dir {root}`"
+        ))
+    })?;
+    let address = address.trim().parse().map_err(Failure::runtime)?;
+    let mut control = ControlClient::new(transport::connect(&address, run_dir.token()).await?);
+    let text = match options.command {
+        CtlCommand::Status => status(&control.status(StatusRequest {}).await?.into_inner(), options.json)?,
+        CtlCommand::Pause => status(&control.pause(PauseRequest {}).await?.into_inner(), options.json)?,
+        CtlCommand::Resume => status(&control.resume(ResumeRequest {}).await?.into_inner(), options.json)?,
+        CtlCommand::Stop => status(&control.stop(StopRequest {}).await?.into_inner(), options.json)?,
+        CtlCommand::Evaluate { tasks, episodes, seed } => {
+            let request = EvaluateRequest { tasks, episodes: episodes.unwrap_or(0), seed };
+            evaluation(&control.evaluate(request).await?.into_inner(), options.json)?
+        }
+        CtlCommand::Checkpoint => {
+            let written = control.checkpoint(CheckpointRequest {}).await?.into_inner();
+            let path = run_dir.root().join(&written.path);
+            let words = format!("{}\nweights digest {}\n", path.display(), written.weights_digest);
+            if options.json { json(&written)? } else { words }
+        }
+    };
+    print!("{text}");
+    Ok(ExitCode::SUCCESS)
+}
+
+fn json(message: &impl serde::Serialize) -> Result<String, Failure> {
+    serde_json::to_string_pretty(message).map(|text| text + "\n").map_err(Failure::runtime)
+}
+
+fn evaluation(evaluation: &Evaluation, as_json: bool) -> Result<String, Failure> {
+    if as_json {
+        return json(evaluation);
+    }
+    let at = format!(
+        "weights {} at {} steps\n",
+        evaluation.weights_version,
+        report::grouped(evaluation.env_steps)
+    );
+    Ok(at + &report::table(&evaluation.tasks))
+}
+
+fn status(status: &RunStatus, as_json: bool) -> Result<String, Failure> {
+    if as_json {
+        return json(status);
+    }
+    let state = status.state().as_str_name().trim_start_matches("RUN_STATE_").to_lowercase();
+    let grouped = report::grouped;
+    let mut lines = vec![
+        format!("{state} for {}", report::duration(status.wall_s)),
+        format!("environment steps  {} of {}", grouped(status.env_steps), grouped(status.env_steps_max)),
+        format!(
+            "episodes           {}, {} in replay",
+            grouped(status.episodes),
+            grouped(status.replay_episodes)
+        ),
+        format!("updates            {}", grouped(status.updates)),
+        format!("epsilon            {:.3}", status.epsilon),
+        format!(
+            "losses             TD {:.4}, contrastive {:.4}, gradient norm {:.4}",
+            status.td_loss, status.contrastive_loss, status.grad_norm
+        ),
+    ];
+    if let Some(ledger) = &status.ledger {
+        let rejected: u64 = ledger.rejected.values().sum();
+        lines.push(format!(
+            "ledger             {} handed out = {} inserted + {} outstanding + {} taken back",
+            grouped(ledger.handed_out),
+            grouped(ledger.inserted),
+            grouped(ledger.outstanding),
+            grouped(rejected)
+        ));
+    }
+    for actor in &status.actors {
+        let (name, pid) = (&actor.name, actor.pid);
+        lines.push(format!("{name:18} process {pid}, {} episodes", grouped(actor.episodes)));
+    }
+    let mut text = lines.join("\n") + "\n";
+    if !status.recent.is_empty() {
+        text += "\nexploring episodes of late\n";
+        text += &report::table(&status.recent);
+    }
+    if let Some(evaluation) = &status.evaluation {
+        text += &format!("\ngreedy evaluation at {} steps\n", grouped(evaluation.env_steps));
+        text += &report::table(&evaluation.tasks);
+    }
+    Ok(text)
+}

@@ -1,0 +1,102 @@
+//! The experiments that come with the program, and a person's own.
+
+use crate::{cli::ConfigOptions, failure::Failure};
+use rit_config::{Config, resolve, set};
+use std::{fs, path::Path, process::ExitCode};
+use toml::Table;
+
+/// Name and text of each, from `deploy/experiments/`.
+const EXPERIMENTS: [(&str, &str); 7] = [
+    ("matrix-game", include_str!("../experiments/matrix-game.toml")),
+    ("matrix-game-vdn", include_str!("../experiments/matrix-game-vdn.toml")),
+    (
+        "matrix-game-no-task-representations",
+        include_str!("../experiments/matrix-game-no-task-representations.toml"),
+    ),
+    (
+        "matrix-game-no-random-permutation",
+        include_str!("../experiments/matrix-game-no-random-permutation.toml"),
+    ),
+    ("cooperative-navigation", include_str!("../experiments/cooperative-navigation.toml")),
+    ("predator-prey", include_str!("../experiments/predator-prey.toml")),
+    ("predator-prey-pro", include_str!("../experiments/predator-prey-pro.toml")),
+];
+
+/// A resolved experiment and the name a run of it gets.
+#[derive(Debug)]
+pub struct Experiment {
+    /// The experiment's name, or its file's.
+    pub name: String,
+    /// What it resolves to.
+    pub config: Config,
+}
+
+/// Resolves what `train` was given.
+///
+/// # Errors
+/// When there is no such experiment or something in it is wrong.
+pub fn from_options(options: &ConfigOptions) -> Result<Experiment, Failure> {
+    let mut settings = options.settings.clone();
+    settings.extend(options.seed.map(|seed| format!("seed={seed}")));
+    settings.extend(options.actors.map(|count| format!("actors.count={count}")));
+    settings.extend(options.steps.map(|steps| format!("training.t_max={steps}")));
+    settings.extend(options.until.as_ref().map(|until| format!("training.until={until:?}")));
+    load(&options.experiment, &settings)
+}
+
+/// Resolves an experiment, by name or by file, under these `section.key=value` settings.
+///
+/// # Errors
+/// When there is no such experiment or something in it is wrong.
+pub fn load(experiment: &str, settings: &[String]) -> Result<Experiment, Failure> {
+    let settings = settings.iter().map(|text| set(text)).collect::<Result<Vec<Table>, _>>()?;
+    if let Some((name, text)) = EXPERIMENTS.iter().find(|(name, _)| *name == experiment) {
+        return Ok(Experiment { name: (*name).to_owned(), config: resolve(text, name, &settings)? });
+    }
+    let path = Path::new(experiment);
+    if path.extension().is_none_or(|extension| extension != "toml") {
+        return Err(unknown(experiment));
+    }
+    let text =
+        fs::read_to_string(path).map_err(|error| Failure::input_message(format!("{experiment}: {error}")))?;
+    let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    Ok(Experiment { name, config: resolve(&text, experiment, &settings)? })
+}
+
+fn unknown(experiment: &str) -> Failure {
+    let likeness = |name: &str| strsim::jaro_winkler(experiment, name);
+    let closest =
+        EXPERIMENTS.map(|(name, _)| name).into_iter().max_by(|a, b| likeness(a).total_cmp(&likeness(b)));
+    let hint = closest.filter(|name| likeness(name) > 0.8).map(|name| format!("did you mean {name}? "));
+    Failure::input_message(format!(
+        "unknown experiment {experiment:?}; {}`rit experiments` lists them, a path ending in .toml is read",
+        hint.unwrap_or_default()
+    ))
+}
+
+/// `rit experiments`.
+#[allow(
+    clippy::print_stdout,
+    clippy::unnecessary_wraps,
+    reason = "a command like the others, and its output"
+)]
+pub fn print() -> Result<ExitCode, Failure> {
+    for (name, text) in EXPERIMENTS {
+        println!("{name:38} {}", text.lines().next().unwrap_or_default().trim_start_matches("# "));
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_experiment_resolves() {
+        for (name, _) in EXPERIMENTS {
+            assert_eq!(load(name, &[]).unwrap().name, name);
+        }
+        let files = fs::read_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/experiments")).unwrap();
+        assert_eq!(files.count(), EXPERIMENTS.len(), "every file is embedded");
+    }
+}

@@ -1,0 +1,122 @@
+//! How a command ends when it does not end well: a one-line message and an exit code.
+
+use rit_actor::ActorError;
+use rit_config::{ConfigError, RunDirError};
+use rit_env::UnknownName;
+use rit_learner::{LearnerError, checkpoint::CheckpointError};
+use rit_proto::transport::ConnectError;
+use std::{fmt, process::ExitCode};
+
+/// Exit code of a run that was interrupted and ended in order, as shells have it for Ctrl-C.
+pub const INTERRUPTED: u8 = 130;
+
+/// A failed command.
+#[derive(Debug)]
+pub enum Failure {
+    /// Something typed or given was wrong: exit code 2, nothing was overwritten.
+    Input(anyhow::Error),
+    /// Something failed on the way: exit code 1.
+    Runtime(anyhow::Error),
+}
+
+impl Failure {
+    /// Something given was wrong.
+    pub fn input(error: impl Into<anyhow::Error>) -> Self {
+        Self::Input(error.into())
+    }
+
+    /// Something given was wrong, in words.
+    pub fn input_message(message: impl fmt::Display) -> Self {
+        Self::Input(anyhow::anyhow!("{message}"))
+    }
+
+    /// Something failed.
+    pub fn runtime(error: impl Into<anyhow::Error>) -> Self {
+        Self::Runtime(error.into())
+    }
+
+    /// Something failed, in words.
+    pub fn runtime_message(message: impl fmt::Display) -> Self {
+        Self::Runtime(anyhow::anyhow!("{message}"))
+    }
+
+    /// Prints the message; returns the exit code.
+    #[allow(clippy::print_stderr, reason = "the last word of a command")]
+    pub fn report(&self) -> ExitCode {
+        let (error, code) = match self {
+            Self::Input(error) => (error, 2),
+            Self::Runtime(error) => (error, 1),
+        };
+        eprintln!("error: {error:#}");
+        ExitCode::from(code)
+    }
+}
+
+impl From<ConfigError> for Failure {
+    fn from(error: ConfigError) -> Self {
+        Self::input(error)
+    }
+}
+
+impl From<RunDirError> for Failure {
+    fn from(error: RunDirError) -> Self {
+        Self::input(error)
+    }
+}
+
+impl From<UnknownName> for Failure {
+    fn from(error: UnknownName) -> Self {
+        Self::input(error)
+    }
+}
+
+impl From<CheckpointError> for Failure {
+    fn from(error: CheckpointError) -> Self {
+        Self::input(error)
+    }
+}
+
+impl From<ConnectError> for Failure {
+    fn from(error: ConnectError) -> Self {
+        Self::runtime(error)
+    }
+}
+
+impl From<LearnerError> for Failure {
+    fn from(error: LearnerError) -> Self {
+        match error {
+            LearnerError::Address(_)
+            | LearnerError::Listen(_)
+            | LearnerError::RunSpace(_)
+            | LearnerError::SharedMemory(_)
+            | LearnerError::Model(_) => Self::input(error),
+            _ => Self::runtime(error),
+        }
+    }
+}
+
+impl From<ActorError> for Failure {
+    fn from(error: ActorError) -> Self {
+        match error {
+            ActorError::NoAddress { .. }
+            | ActorError::Address(_)
+            | ActorError::Refused(_)
+            | ActorError::Model(_)
+            | ActorError::RunSpace(_)
+            | ActorError::SharedMemory(_) => Self::input(error),
+            _ => Self::runtime(error),
+        }
+    }
+}
+
+impl From<tonic::Status> for Failure {
+    fn from(status: tonic::Status) -> Self {
+        let message = status.message().to_owned();
+        match status.code() {
+            tonic::Code::InvalidArgument | tonic::Code::NotFound | tonic::Code::AlreadyExists => {
+                Self::input_message(message)
+            }
+            _ => Self::runtime_message(format!("the learner answers: {message}")),
+        }
+    }
+}

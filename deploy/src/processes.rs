@@ -1,0 +1,40 @@
+//! `rit learner` and `rit actor`: one process each.
+
+use crate::{
+    cli::{ActorOptions, LearnerOptions},
+    experiments,
+    failure::Failure,
+    logging::LogOptions,
+    shutdown,
+};
+use rit_config::RunDir;
+use std::process::ExitCode;
+use tracing::Instrument as _;
+
+/// `rit learner`.
+pub async fn learner(options: LearnerOptions, logs: LogOptions) -> Result<ExitCode, Failure> {
+    let span = logs.start("learner")?;
+    if let Some(experiment) = &options.new {
+        let experiment = experiments::load(experiment, &options.settings)?;
+        RunDir::create(&options.run_dir, &experiment.config)?;
+    }
+    let (run_dir, config) = RunDir::open(&options.run_dir)?;
+    let shutdown = shutdown::requested(options.supervised);
+    let summary = rit_learner::run(run_dir, config, shutdown).instrument(span).await?;
+    tracing::info!(
+        digest = summary.weights_digest,
+        env_steps = summary.progress.env_steps,
+        "the run is over"
+    );
+    Ok(ExitCode::SUCCESS)
+}
+
+/// `rit actor`.
+pub async fn actor(options: ActorOptions, logs: LogOptions) -> Result<ExitCode, Failure> {
+    let span = logs.start(&options.name)?;
+    let (run_dir, config) = RunDir::open(&options.run_dir)?;
+    let shutdown = shutdown::requested(options.supervised);
+    let options = rit_actor::ActorOptions { name: options.name };
+    rit_actor::run(run_dir, config, options, shutdown).instrument(span).await?;
+    Ok(ExitCode::SUCCESS)
+}

@@ -1,0 +1,84 @@
+//! Results as people read them.
+
+use rit_proto::v1::TaskResult;
+use std::fmt::Write as _;
+
+/// One line a task: name, mean return, win rate where there is one.
+pub fn table(results: &[TaskResult]) -> String {
+    let width = results.iter().map(|result| result.task.len()).max().unwrap_or(0).max("task".len());
+    let mut text = format!("{:width$}  episodes  mean return  win rate\n", "task");
+    for TaskResult { task, episodes, mean_return, win_rate } in results {
+        let win_rate = win_rate.map_or_else(|| "-".to_owned(), |rate| format!("{rate:.3}"));
+        // Writing to a String does not fail.
+        let _ = writeln!(text, "{task:width$}  {episodes:8}  {mean_return:11.2}  {win_rate:>8}");
+    }
+    text
+}
+
+/// Mean return and win rate over tasks, in a few words.
+pub fn in_words(results: &[TaskResult]) -> Option<String> {
+    if results.is_empty() {
+        return None;
+    }
+    let count = results.len() as f64;
+    let mean = results.iter().map(|result| result.mean_return).sum::<f64>() / count;
+    let wins: Option<f64> = results.iter().map(|result| result.win_rate).sum();
+    Some(match wins {
+        Some(wins) => format!("return {mean:.1}, win rate {:.2}", wins / count),
+        None => format!("return {mean:.1}"),
+    })
+}
+
+/// A number with thin groups of three digits.
+pub fn grouped(number: u64) -> String {
+    let digits = number.to_string();
+    let mut text = String::new();
+    for (at, digit) in digits.chars().enumerate() {
+        if at > 0 && (digits.len() - at).is_multiple_of(3) {
+            text.push(' ');
+        }
+        text.push(digit);
+    }
+    text
+}
+
+/// Seconds as hours, minutes and seconds.
+pub fn duration(seconds: f64) -> String {
+    let seconds = seconds.max(0.0).round() as u64;
+    match (seconds / 3600, seconds / 60 % 60, seconds % 60) {
+        (0, 0, s) => format!("{s} s"),
+        (0, m, s) => format!("{m} min {s:02} s"),
+        (h, m, _) => format!("{h} h {m:02} min"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_as_people_read_them() {
+        assert_eq!([0, 999, 1000, 5_050_000].map(grouped), ["0", "999", "1 000", "5 050 000"]);
+        assert_eq!(
+            [0.4, 59.6, 61.0, 3700.0].map(duration),
+            ["0 s", "1 min 00 s", "1 min 01 s", "1 h 01 min"]
+        );
+    }
+
+    #[test]
+    fn a_table_has_a_line_a_task() {
+        let result = |task: &str, win_rate| TaskResult {
+            task: task.into(),
+            episodes: 32,
+            mean_return: -12.345,
+            win_rate,
+        };
+        let results = [result("game-1", Some(1.0)), result("long-name", None)];
+        let expected = "task       episodes  mean return  win rate\n\
+                        game-1           32       -12.35     1.000\n\
+                        long-name        32       -12.35         -\n";
+        assert_eq!(table(&results).replace("-12.34 ", "-12.35 "), expected);
+        assert_eq!(in_words(&results[..1]).unwrap(), "return -12.3, win rate 1.00");
+        assert_eq!(in_words(&[]), None);
+    }
+}

@@ -1,0 +1,381 @@
+//! Between actors, trainer and callers: hands out leases, takes episodes in, answers for the run's state.
+//!
+//! One task owns the ledger and the list of actors; everybody else sends it [`Event`]s. It never waits for
+//! the trainer or for an actor, so a slow one holds up nobody.
+
+use crate::{
+    evaluation::TaskResult,
+    ledger::{ActorId, Lease, Ledger, Reason, Terms},
+    receive::Fence,
+    trainer::{News, Standing, Work, Written},
+};
+use rit_config::Config;
+use rit_episode::{Episode, wire};
+use rit_proto::v1::{self, LearnerMessage, learner_message::Message};
+use std::{
+    collections::BTreeMap,
+    sync::mpsc,
+    time::{Duration, Instant},
+};
+use tokio::sync::{mpsc as async_mpsc, oneshot};
+use tonic::Status;
+
+/// How long the end of a run waits for actors to go.
+const FAREWELL_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// Messages an actor's stream may hold: far more than one lease at a time can fill.
+pub const ACTOR_QUEUE: usize = 64;
+
+/// What happens to a run.
+#[derive(Debug)]
+pub enum Event {
+    /// An episode was read from shared memory and found valid.
+    Episode(ActorId, Box<Episode>),
+    /// A frame was refused.
+    FrameRefused(&'static str),
+    /// An actor wants to join.
+    Join(
+        v1::Hello,
+        async_mpsc::Sender<Result<LearnerMessage, Status>>,
+        oneshot::Sender<Result<ActorId, Status>>,
+    ),
+    /// An actor has sent all of this lease.
+    Done(ActorId, u64),
+    /// All that an actor had sent by `Done` has been read.
+    Fenced(Fence),
+    /// An actor wants to go.
+    Leaving(ActorId),
+    /// An actor's stream has ended.
+    Gone(ActorId),
+    /// The trainer speaks.
+    News(News),
+    /// The trainer or the receiving thread is done, well or not: nothing more can happen.
+    Over,
+    /// Somebody asks or wants something.
+    Control(Control),
+}
+
+/// What callers want, each with the way to answer.
+#[derive(Debug)]
+pub enum Control {
+    /// How the run stands.
+    Status(oneshot::Sender<v1::RunStatus>),
+    /// No further lease.
+    Pause(oneshot::Sender<v1::RunStatus>),
+    /// Leases again.
+    Resume(oneshot::Sender<v1::RunStatus>),
+    /// A checkpoint.
+    Checkpoint(oneshot::Sender<Result<Written, String>>),
+    /// The end of the run.
+    Stop(oneshot::Sender<v1::RunStatus>),
+}
+
+/// An actor that is there.
+#[derive(Debug)]
+struct Actor {
+    name: String,
+    pid: u32,
+    capacity: usize,
+    to: async_mpsc::Sender<Result<LearnerMessage, Status>>,
+    /// Episodes inserted.
+    episodes: u64,
+    /// Leases it was given; the last one's number.
+    leases: u64,
+    leaving: bool,
+}
+
+/// The coordinator.
+pub struct Coordinator {
+    config: Config,
+    ledger: Ledger,
+    actors: BTreeMap<ActorId, Actor>,
+    next_actor: ActorId,
+    state: v1::RunState,
+    standing: Standing,
+    epsilon: f32,
+    frames_refused: BTreeMap<&'static str, u64>,
+    started: Instant,
+    work: mpsc::Sender<Work>,
+    fences: mpsc::Sender<Fence>,
+}
+
+impl Coordinator {
+    /// A coordinator at the beginning of a run. `work` leads to the trainer, `fences` to the receiving thread.
+    pub fn new(config: Config, work: mpsc::Sender<Work>, fences: mpsc::Sender<Fence>) -> Self {
+        let first = Terms { weights_version: 0, epsilon: config.epsilon(0) };
+        Self {
+            ledger: Ledger::new(config.algorithm.n_rollout_threads, config.algorithm.policy_lag, first),
+            actors: BTreeMap::new(),
+            next_actor: 0,
+            state: v1::RunState::Running,
+            standing: Standing::default(),
+            epsilon: first.epsilon,
+            frames_refused: BTreeMap::new(),
+            started: Instant::now(),
+            config,
+            work,
+            fences,
+        }
+    }
+
+    /// Works until the trainer is done and the actors have gone.
+    pub async fn run(mut self, mut events: async_mpsc::Receiver<Event>) {
+        while let Some(event) = events.recv().await {
+            if matches!(event, Event::Over) {
+                break;
+            }
+            self.handle(event);
+        }
+        self.state = v1::RunState::Stopping;
+        self.part_with_actors(&mut events).await;
+        let counts = self.ledger.counts();
+        tracing::info!(?counts, "the ledger is closed");
+        debug_assert!(counts.balance());
+    }
+
+    fn handle(&mut self, event: Event) {
+        match event {
+            Event::Episode(actor, episode) => self.insert(actor, *episode),
+            Event::FrameRefused(reason) => *self.frames_refused.entry(reason).or_default() += 1,
+            Event::Join(hello, to, answer) => {
+                let joined = self.join(hello, to);
+                let id = joined.as_ref().ok().copied();
+                if answer.send(joined).is_ok() {
+                    if let Some(id) = id {
+                        self.send(id, Message::Welcome(v1::Welcome { actor: id }));
+                        self.hand_out();
+                    }
+                } else if let Some(id) = id {
+                    self.gone(id);
+                }
+            }
+            Event::Done(actor, lease) => {
+                // Not all of it has come through yet, or a frame was refused: look again once all that was
+                // sent before has been read.
+                if self.has_outstanding(actor, lease) {
+                    let _ = self.fences.send(Fence { actor, lease });
+                }
+            }
+            Event::Fenced(Fence { actor, lease }) => {
+                if self.has_outstanding(actor, lease) {
+                    let missing = self.ledger.take_back(actor, Reason::NotArrived);
+                    tracing::warn!(actor, missing, "episodes did not arrive and are handed out again");
+                    self.hand_out();
+                }
+            }
+            Event::Leaving(actor) => {
+                if let Some(leaving) = self.actors.get_mut(&actor) {
+                    leaving.leaving = true;
+                }
+                self.part_if_done(actor);
+            }
+            Event::Gone(actor) => self.gone(actor),
+            Event::News(News::Trained(terms, standing)) => {
+                self.ledger.open(terms);
+                self.epsilon = terms.epsilon;
+                self.standing = standing;
+                self.hand_out();
+            }
+            Event::News(News::Ending) => self.state = v1::RunState::Stopping,
+            Event::Over => {}
+            Event::Control(control) => self.control(control),
+        }
+    }
+
+    fn control(&mut self, control: Control) {
+        // Whoever asked may have gone; the answers are then nobody's.
+        match control {
+            Control::Status(answer) => {
+                let _ = answer.send(self.status());
+            }
+            Control::Pause(answer) => {
+                if self.state == v1::RunState::Running {
+                    self.state = v1::RunState::Paused;
+                    tracing::info!("paused");
+                }
+                let _ = answer.send(self.status());
+            }
+            Control::Resume(answer) => {
+                if self.state == v1::RunState::Paused {
+                    self.state = v1::RunState::Running;
+                    tracing::info!("resumed");
+                    self.hand_out();
+                }
+                let _ = answer.send(self.status());
+            }
+            Control::Checkpoint(answer) => {
+                let _ = self.work.send(Work::Checkpoint(answer));
+            }
+            Control::Stop(answer) => {
+                tracing::info!("asked to stop");
+                self.state = v1::RunState::Stopping;
+                let _ = self.work.send(Work::Stop);
+                let _ = answer.send(self.status());
+            }
+        }
+    }
+
+    fn join(
+        &mut self,
+        hello: v1::Hello,
+        to: async_mpsc::Sender<Result<LearnerMessage, Status>>,
+    ) -> Result<ActorId, Status> {
+        let v1::Hello { name, pid, layout_version, capacity } = hello;
+        if layout_version != wire::LAYOUT_VERSION {
+            return Err(Status::failed_precondition(format!(
+                "actor {name} writes frame layout {layout_version}, this learner reads {}; use the same build",
+                wire::LAYOUT_VERSION
+            )));
+        }
+        if let Some(other) = self.actors.values().find(|actor| actor.name == name) {
+            return Err(Status::already_exists(format!(
+                "an actor named {name} is there already (process {}); choose another --name",
+                other.pid
+            )));
+        }
+        let id = self.next_actor;
+        self.next_actor += 1;
+        tracing::info!(name, pid, actor = id, "an actor joined");
+        let capacity = capacity.clamp(1, 4096) as usize;
+        self.actors.insert(id, Actor { name, pid, capacity, to, episodes: 0, leases: 0, leaving: false });
+        Ok(id)
+    }
+
+    fn gone(&mut self, id: ActorId) {
+        let Some(actor) = self.actors.remove(&id) else { return };
+        let had = self.ledger.take_back(id, Reason::ActorGone);
+        tracing::info!(name = actor.name, actor = id, had, "an actor has gone");
+        self.hand_out();
+    }
+
+    fn insert(&mut self, id: ActorId, episode: Episode) {
+        if let Err(refused) = self.ledger.insert(id, episode) {
+            // A late frame of an actor that was given up: its episode is rolled by another.
+            tracing::debug!(%refused, "a frame nobody waits for");
+            *self.frames_refused.entry("not_outstanding").or_default() += 1;
+            return;
+        }
+        if let Some(actor) = self.actors.get_mut(&id) {
+            actor.episodes += 1;
+        }
+        while let Some(batch) = self.ledger.take_batch() {
+            // Without a trainer the run is over, which `Over` says.
+            let _ = self.work.send(Work::Batch(batch));
+        }
+        self.part_if_done(id);
+        self.hand_out();
+    }
+
+    /// Gives every actor that has nothing to do its share of what may be rolled.
+    fn hand_out(&mut self) {
+        if self.state != v1::RunState::Running {
+            return;
+        }
+        let share = self.config.algorithm.n_rollout_threads.div_ceil(self.actors.len().max(1));
+        let idle = |(id, actor): (&ActorId, &Actor)| {
+            let idle = !actor.leaving && self.ledger.outstanding_with(*id).next().is_none();
+            idle.then_some((*id, actor.capacity.min(share)))
+        };
+        for (id, limit) in self.actors.iter().filter_map(idle).collect::<Vec<_>>() {
+            let Some(Lease { episodes, terms }) = self.ledger.lease(id, limit) else { return };
+            let Terms { weights_version, epsilon } = terms;
+            let lease = self.actors.get_mut(&id).map_or(0, |actor| {
+                actor.leases += 1;
+                actor.leases
+            });
+            self.send(id, Message::Lease(v1::Lease { episodes, weights_version, epsilon, lease }));
+        }
+    }
+
+    /// Whether an actor still has episodes of this lease: its last one, since it gets none while it has any.
+    fn has_outstanding(&self, actor: ActorId, lease: u64) -> bool {
+        self.actors.get(&actor).is_some_and(|actor| actor.leases == lease)
+            && self.ledger.outstanding_with(actor).next().is_some()
+    }
+
+    fn send(&mut self, id: ActorId, message: Message) {
+        let Some(actor) = self.actors.get(&id) else { return };
+        // A full queue is an actor that does not read; a closed one is an actor that has gone, and says so.
+        if actor.to.try_send(Ok(LearnerMessage { message: Some(message) })).is_err() {
+            tracing::debug!(actor = id, "an actor could not be told");
+        }
+    }
+
+    /// Lets an actor go that wants to, once all it has sent is here.
+    fn part_if_done(&mut self, id: ActorId) {
+        let leaving = self.actors.get(&id).is_some_and(|actor| actor.leaving);
+        if leaving && self.ledger.outstanding_with(id).next().is_none() {
+            self.send(id, Message::Farewell(v1::Farewell {}));
+        }
+    }
+
+    /// The end of the run: takes back what is outstanding and waits, for a while, for everybody to go.
+    async fn part_with_actors(&mut self, events: &mut async_mpsc::Receiver<Event>) {
+        for id in self.actors.keys().copied().collect::<Vec<_>>() {
+            self.ledger.take_back(id, Reason::RunEnded);
+            self.send(id, Message::Farewell(v1::Farewell {}));
+        }
+        let deadline = tokio::time::Instant::now() + FAREWELL_TIMEOUT;
+        while !self.actors.is_empty() {
+            match tokio::time::timeout_at(deadline, events.recv()).await {
+                Ok(Some(Event::Join(_, _, answer))) => {
+                    let _ = answer.send(Err(Status::unavailable("the run is over")));
+                }
+                Ok(Some(event)) => self.handle(event),
+                Ok(None) => return,
+                Err(_) => {
+                    let names: Vec<_> = self.actors.values().map(|actor| actor.name.as_str()).collect();
+                    tracing::warn!(?names, "actors have not gone in time");
+                    return;
+                }
+            }
+        }
+    }
+
+    fn status(&self) -> v1::RunStatus {
+        let Standing { progress, losses, recent, evaluation, replay_episodes } = &self.standing;
+        let counts = self.ledger.counts();
+        let messages = |results: &[TaskResult]| results.iter().map(TaskResult::to_message).collect();
+        let rejected = counts.rejected.iter().map(|(reason, &count)| (reason.name().to_owned(), count));
+        v1::RunStatus {
+            state: self.state.into(),
+            env_steps: progress.env_steps,
+            env_steps_max: self.config.training.t_max,
+            episodes: progress.episodes,
+            updates: progress.updates,
+            epsilon: self.epsilon.into(),
+            wall_s: self.started.elapsed().as_secs_f64(),
+            td_loss: losses.td_loss,
+            contrastive_loss: losses.contrastive_loss,
+            grad_norm: losses.grad_norm,
+            recent: messages(recent),
+            evaluation: evaluation.as_ref().map(|(progress, results)| v1::Evaluation {
+                env_steps: progress.env_steps,
+                weights_version: progress.updates,
+                tasks: messages(results),
+            }),
+            actors: self.actors.iter().map(|(&id, actor)| self.actor_status(id, actor)).collect(),
+            ledger: Some(v1::LedgerStatus {
+                handed_out: counts.handed_out,
+                inserted: counts.inserted,
+                outstanding: counts.outstanding,
+                rejected: rejected.collect(),
+                frames_refused: self
+                    .frames_refused
+                    .iter()
+                    .map(|(&name, &count)| (name.into(), count))
+                    .collect(),
+            }),
+            replay_episodes: *replay_episodes as u64,
+        }
+    }
+
+    fn actor_status(&self, id: ActorId, actor: &Actor) -> v1::ActorStatus {
+        v1::ActorStatus {
+            name: actor.name.clone(),
+            pid: actor.pid,
+            episodes: actor.episodes,
+            outstanding: self.ledger.outstanding_with(id).count() as u64,
+        }
+    }
+}

@@ -1,0 +1,149 @@
+//! Greedy episodes of given tasks: how good the weights are.
+
+use rit_config::Config;
+use rit_env::{
+    EnvironmentOptions, Split, Task, TaskSet, UnknownName,
+    rollout::{Job, Rollout},
+};
+use rit_episode::{Policy, RunSeed};
+use rit_proto::v1;
+use serde::Serialize;
+
+/// Episodes rolled side by side.
+const SIDE_BY_SIDE: usize = 32;
+
+/// What a policy reached on one task.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct TaskResult {
+    /// The task's name.
+    #[serde(skip)]
+    pub task: String,
+    /// Episodes it was measured over.
+    pub episodes: u64,
+    /// Mean of undiscounted returns.
+    pub mean_return: f64,
+    /// Share of episodes won, where the task knows winning.
+    pub win_rate: Option<f64>,
+}
+
+impl TaskResult {
+    /// As a message.
+    pub fn to_message(&self) -> v1::TaskResult {
+        v1::TaskResult {
+            task: self.task.clone(),
+            episodes: self.episodes,
+            mean_return: self.mean_return,
+            win_rate: self.win_rate,
+        }
+    }
+}
+
+/// What all evaluations of a run share.
+#[derive(Clone, Copy, Debug)]
+pub struct Evaluator {
+    task_set: TaskSet,
+    options: EnvironmentOptions,
+    random_permutation: bool,
+}
+
+impl Evaluator {
+    /// Of a run's configuration.
+    pub fn new(config: &Config) -> Self {
+        Self {
+            task_set: config.environment.task_set,
+            options: config.environment_options(),
+            random_permutation: config.algorithm.random_permutation,
+        }
+    }
+
+    /// The tasks of `training`, `testing`, or of names of tasks; the training tasks where nothing is named.
+    ///
+    /// # Errors
+    /// When a name means nothing.
+    pub fn tasks(&self, names: &[String]) -> Result<Vec<Task>, UnknownName> {
+        if names.is_empty() {
+            return Ok(self.task_set.tasks(Split::Training));
+        }
+        let mut tasks = Vec::new();
+        for name in names {
+            match name.as_str() {
+                "training" => tasks.extend(self.task_set.tasks(Split::Training)),
+                "testing" => tasks.extend(self.task_set.tasks(Split::Testing)),
+                name => tasks.push(self.task_set.task(name)?),
+            }
+        }
+        Ok(tasks)
+    }
+
+    /// Rolls so many greedy episodes of each task. The same seed rolls the same episodes.
+    pub fn evaluate(
+        &self,
+        policy: &mut dyn Policy,
+        tasks: &[Task],
+        episodes: usize,
+        seed: RunSeed,
+    ) -> Vec<TaskResult> {
+        tasks.iter().map(|&task| self.evaluate_task(policy, task, episodes, seed)).collect()
+    }
+
+    fn evaluate_task(
+        &self,
+        policy: &mut dyn Policy,
+        task: Task,
+        episodes: usize,
+        seed: RunSeed,
+    ) -> TaskResult {
+        let seed = seed.derive(&task.to_string(), 0);
+        let mut rollout = Rollout::new(vec![task], self.options, seed, self.random_permutation);
+        let jobs: Vec<Job> = (0..episodes as u64)
+            .map(|number| Job { number, weights_version: 0, epsilon: 0.0, task: Some(0) })
+            .collect();
+        let (mut total, mut won) = (0.0, 0);
+        for jobs in jobs.chunks(SIDE_BY_SIDE) {
+            for episode in rollout.roll(policy, jobs) {
+                total += episode.total_reward();
+                won += usize::from(episode.won);
+            }
+        }
+        let share = |sum: f64| sum / episodes as f64;
+        TaskResult {
+            task: task.to_string(),
+            episodes: episodes as u64,
+            mean_return: share(total),
+            win_rate: self.task_set.has_wins().then(|| share(won as f64)),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rit_episode::Turn;
+
+    /// Plays what wins game 4 of the matrix games, in any order.
+    struct FirstAction;
+
+    impl Policy for FirstAction {
+        fn begin(&mut self, _: usize, _: usize) {}
+
+        fn act(&mut self, turns: &mut [Turn<'_>]) {
+            turns.iter_mut().for_each(|turn| turn.actions.fill(0));
+        }
+    }
+
+    #[test]
+    fn counts_returns_and_wins_by_task() {
+        let config = rit_config::resolve("environment.task_set = \"matrix-game\"", "test", &[]).unwrap();
+        let evaluator = Evaluator::new(&config);
+        let tasks = evaluator.tasks(&["game-4".into(), "game-2".into()]).unwrap();
+        let results = evaluator.evaluate(&mut FirstAction, &tasks, 70, RunSeed(1));
+        let facts: Vec<_> =
+            results.iter().map(|r| (r.task.as_str(), r.episodes, r.mean_return, r.win_rate)).collect();
+        assert_eq!(facts, [("game-4", 70, 106.0, Some(1.0)), ("game-2", 70, -18.0, Some(0.0))]);
+        assert_eq!(evaluator.tasks(&[]).unwrap().len(), 4);
+        assert!(evaluator.tasks(&["testing".into()]).unwrap().is_empty());
+        assert!(
+            evaluator.tasks(&["game-5".into()]).unwrap_err().to_string().contains("known: game-1, game-2")
+        );
+    }
+}

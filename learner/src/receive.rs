@@ -1,0 +1,71 @@
+//! The receiving thread: reads frames where they lie, checks them, and passes episodes on.
+
+use crate::{coordinator::Event, ledger::ActorId};
+use rit_episode::wire::{self, Expected};
+use rit_ipc::{EpisodeReceiver, ReceiveError};
+use std::{
+    sync::{
+        atomic::{AtomicBool, Ordering},
+        mpsc,
+    },
+    time::{Duration, Instant},
+};
+use tokio::sync::mpsc as async_mpsc;
+
+/// How long a wait for frames lasts before fences and the end of the run are looked at.
+const WAIT: Duration = Duration::from_millis(50);
+
+/// How often the places of dead actors are looked for.
+const REAP_EVERY: Duration = Duration::from_secs(1);
+
+/// Asks to be told, by [`Event::Fenced`], when all that was sent before has been passed on.
+#[derive(Clone, Copy, Debug)]
+pub struct Fence {
+    /// Whose frames.
+    pub actor: ActorId,
+    /// Of which lease.
+    pub lease: u64,
+}
+
+/// Receives until `stop` is set or nobody listens any more.
+///
+/// # Errors
+/// When shared memory fails.
+pub fn receive(
+    mut receiver: EpisodeReceiver,
+    expected: &Expected,
+    events: &async_mpsc::Sender<Event>,
+    fences: &mpsc::Receiver<Fence>,
+    stop: &AtomicBool,
+) -> Result<(), ReceiveError> {
+    let mut reaped = Instant::now();
+    while !stop.load(Ordering::Relaxed) {
+        // Fences are taken up before frames are read and answered after.
+        let fences: Vec<Fence> = fences.try_iter().collect();
+        while let Some(frame) = receiver.receive()? {
+            let header = frame.header();
+            let event = match wire::decode(header, frame.payload(), expected) {
+                Ok(episode) => Event::Episode(header.actor, Box::new(episode)),
+                Err(rejection) => {
+                    tracing::warn!(%rejection, "refused a frame");
+                    Event::FrameRefused(rejection.reason())
+                }
+            };
+            drop(frame);
+            if events.blocking_send(event).is_err() {
+                return Ok(());
+            }
+        }
+        for fence in fences {
+            if events.blocking_send(Event::Fenced(fence)).is_err() {
+                return Ok(());
+            }
+        }
+        if reaped.elapsed() >= REAP_EVERY {
+            receiver.reap_dead()?;
+            reaped = Instant::now();
+        }
+        receiver.wait(WAIT)?;
+    }
+    Ok(())
+}

@@ -1,0 +1,307 @@
+//! Training: batches of episodes in, weights out (paper, algorithm 1). One thread, which owns replay and
+//! weights; nothing it does depends on time.
+
+use crate::{
+    checkpoint::{self, CheckpointError, Progress},
+    evaluation::{Evaluator, TaskResult},
+    ledger::Terms,
+    metrics::{Line, MetricsFile, Recent, by_task},
+    replay::Replay,
+    weights::{Snapshot, WeightsBoard},
+};
+use rit_algo::{Acting, Losses, Rit, Update};
+use rit_config::{Config, RunDir, Until};
+use rit_env::Split;
+use rit_episode::{Episode, RunSeed, Stream};
+use serde::Serialize;
+use std::{
+    collections::BTreeMap,
+    fs, io,
+    path::PathBuf,
+    sync::{Arc, mpsc},
+};
+use tokio::sync::oneshot;
+
+/// What the trainer is asked to do, one after another.
+#[derive(Debug)]
+pub enum Work {
+    /// The next batch in order of number.
+    Batch(Vec<Episode>),
+    /// Write a checkpoint now.
+    Checkpoint(oneshot::Sender<Result<Written, String>>),
+    /// End the run.
+    Stop,
+}
+
+/// A checkpoint that was asked for.
+#[derive(Debug)]
+pub struct Written {
+    /// Relative to the run directory.
+    pub path: PathBuf,
+    /// How far training had come.
+    pub progress: Progress,
+    /// Digest of the weights.
+    pub weights_digest: String,
+}
+
+/// How training stands: what status answers are made of.
+#[derive(Clone, Debug, Default)]
+pub struct Standing {
+    /// How far it has come.
+    pub progress: Progress,
+    /// Losses of the last update.
+    pub losses: Losses,
+    /// Exploring episodes of late.
+    pub recent: Vec<TaskResult>,
+    /// The newest scheduled evaluation, with the progress it was made at.
+    pub evaluation: Option<(Progress, Vec<TaskResult>)>,
+    /// Episodes in replay.
+    pub replay_episodes: usize,
+}
+
+/// What the trainer says while it works.
+#[derive(Debug)]
+pub enum News {
+    /// A batch is done: another may be rolled on these terms.
+    Trained(Terms, Standing),
+    /// The run is over and will take no further batch; its last files are being written.
+    Ending,
+}
+
+/// What a run came to: `summary.json`.
+#[derive(Clone, Debug, Serialize)]
+pub struct Summary {
+    /// How far training came.
+    #[serde(flatten)]
+    pub progress: Progress,
+    /// Seconds the learner ran.
+    pub wall_s: f64,
+    /// SHA-256 of the final weights.
+    pub weights_digest: String,
+    /// Greedy episodes of the final weights, by training task.
+    pub evaluation: BTreeMap<String, TaskResult>,
+}
+
+/// Why training ended early.
+#[derive(Debug, thiserror::Error)]
+pub enum TrainError {
+    /// A checkpoint could not be written.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    /// Another file of the run directory could not be written.
+    #[error("{path}: {error}")]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        error: io::Error,
+    },
+    /// The update's threads could not be started.
+    #[error("cannot start the update's threads: {0}")]
+    Threads(String),
+    /// The weights are no numbers any more.
+    #[error("the loss is not finite after {0} updates; a smaller algorithm.lr may help")]
+    NotFinite(u64),
+}
+
+/// The trainer.
+pub struct Trainer {
+    config: Config,
+    run_dir: RunDir,
+    rit: Arc<Rit>,
+    update: Update,
+    replay: Replay,
+    board: Arc<WeightsBoard>,
+    evaluator: Evaluator,
+    metrics: MetricsFile,
+    recent: Recent,
+    standing: Standing,
+    /// Collected episodes when the target network was last copied.
+    target_copied_at: u64,
+    news: Box<dyn FnMut(News) + Send>,
+}
+
+impl Trainer {
+    /// A trainer at the beginning of a run, and the board it publishes its weights on. `news` must not wait.
+    ///
+    /// # Errors
+    /// When the metrics file or the update's threads cannot be had.
+    pub fn new(
+        config: Config,
+        run_dir: RunDir,
+        rit: Arc<Rit>,
+        news: Box<dyn FnMut(News) + Send>,
+    ) -> Result<(Self, Arc<WeightsBoard>), TrainError> {
+        let params = rit.layout.initial(&mut config.seed.stream(Stream::Weights, 0));
+        let update = Update::new(Arc::clone(&rit), config.update(), params)
+            .map_err(|error| TrainError::Threads(error.to_string()))?;
+        let path = run_dir.metrics();
+        let metrics = MetricsFile::open(&path).map_err(|error| TrainError::Io { path, error })?;
+        let first = Snapshot::new(0, 0, &update.params[rit.acting()]);
+        let board = Arc::new(WeightsBoard::new(first, config.algorithm.policy_lag));
+        let task_set = config.environment.task_set;
+        let tasks = task_set.tasks(Split::Training).iter().map(ToString::to_string).collect();
+        let trainer = Self {
+            replay: Replay::new(config.algorithm.buffer_size),
+            board: Arc::clone(&board),
+            evaluator: Evaluator::new(&config),
+            metrics,
+            recent: Recent::new(tasks, task_set.has_wins()),
+            standing: Standing::default(),
+            target_copied_at: 0,
+            news,
+            rit,
+            update,
+            run_dir,
+            config,
+        };
+        Ok((trainer, board))
+    }
+
+    /// Works until the run is over or nobody can ask any more, then writes checkpoint and summary.
+    ///
+    /// # Errors
+    /// When a file cannot be written or the weights diverge.
+    pub fn run(mut self, work: &mpsc::Receiver<Work>) -> Result<Summary, TrainError> {
+        self.evaluate()?;
+        while let Ok(work) = work.recv() {
+            match work {
+                Work::Batch(episodes) => {
+                    let over = self.train(episodes)?;
+                    let terms = Terms {
+                        weights_version: self.standing.progress.updates,
+                        epsilon: self.config.epsilon(self.standing.progress.env_steps),
+                    };
+                    (self.news)(News::Trained(terms, self.standing.clone()));
+                    if over {
+                        break;
+                    }
+                }
+                Work::Checkpoint(answer) => {
+                    let written = self.checkpoint().map_err(|error| error.to_string());
+                    // Whoever asked may have gone.
+                    let _ = answer.send(written);
+                }
+                Work::Stop => break,
+            }
+        }
+        (self.news)(News::Ending);
+        self.finish()
+    }
+
+    /// One batch: into replay, one update, and whatever is due. Returns whether the run is over.
+    fn train(&mut self, episodes: Vec<Episode>) -> Result<bool, TrainError> {
+        let algorithm = &self.config.algorithm;
+        let before = self.standing.progress;
+        let progress = &mut self.standing.progress;
+        for episode in episodes {
+            progress.env_steps += episode.steps() as u64;
+            progress.episodes += 1;
+            self.recent.push(&episode);
+            self.replay.insert(episode);
+        }
+        if self.replay.len() >= algorithm.batch_size {
+            let seed = self.config.seed;
+            let batch =
+                self.replay.sample(algorithm.batch_size, &mut seed.stream(Stream::Replay, progress.updates));
+            let pairing = &mut seed.stream(Stream::Pairing, progress.updates);
+            self.standing.losses = self.update.step(&batch, pairing);
+            progress.updates += 1;
+            if !self.standing.losses.grad_norm.is_finite() {
+                return Err(TrainError::NotFinite(progress.updates));
+            }
+            if progress.episodes - self.target_copied_at >= algorithm.target_update_interval {
+                self.update.update_target();
+                self.target_copied_at = progress.episodes;
+            }
+            let acting = &self.update.params[self.rit.acting()];
+            self.board.publish(Snapshot::new(progress.updates, progress.env_steps, acting));
+        }
+        let after = *progress;
+        self.standing.replay_episodes = self.replay.len();
+        self.standing.recent = self.recent.results();
+        let due = |every: u64| after.env_steps / every > before.env_steps / every;
+        if due(self.config.learner.metrics_every_env_steps) {
+            let standing = &self.standing;
+            let line = Line::Training {
+                progress: after,
+                wall_s: self.metrics.wall_s(),
+                epsilon: self.config.epsilon(after.env_steps).into(),
+                losses: standing.losses.into(),
+                tasks: by_task(&standing.recent),
+            };
+            self.metrics
+                .write(&line)
+                .map_err(|error| TrainError::Io { path: self.run_dir.metrics(), error })?;
+        }
+        let mut over = after.env_steps >= self.config.training.t_max;
+        if due(self.config.evaluation.every_env_steps) {
+            let results = self.evaluate()?;
+            over |= self.reached(&results);
+        }
+        Ok(over)
+    }
+
+    /// The scheduled evaluation of the training tasks: always the same episodes, so that one curve's points
+    /// differ by the weights alone.
+    fn evaluate(&mut self) -> Result<Vec<TaskResult>, TrainError> {
+        let progress = self.standing.progress;
+        let results = self.greedy(self.config.evaluation.episodes);
+        let line = Line::Evaluation { progress, wall_s: self.metrics.wall_s(), tasks: by_task(&results) };
+        self.metrics.write(&line).map_err(|error| TrainError::Io { path: self.run_dir.metrics(), error })?;
+        tracing::info!(env_steps = progress.env_steps, results = %in_words(&results), "evaluated");
+        self.standing.evaluation = Some((progress, results.clone()));
+        Ok(results)
+    }
+
+    fn greedy(&self, episodes: usize) -> Vec<TaskResult> {
+        let mut acting = Acting::new(Arc::clone(&self.rit), &self.update.params[self.rit.acting()]);
+        let tasks = self.config.environment.task_set.tasks(Split::Training);
+        self.evaluator.evaluate(&mut acting, &tasks, episodes, evaluation_seed(&self.config))
+    }
+
+    fn reached(&self, results: &[TaskResult]) -> bool {
+        match self.config.training.until {
+            Until::Never => false,
+            Until::WinRate(goal) => results.iter().all(|result| result.win_rate >= Some(goal)),
+            Until::MeanReturn(goal) => results.iter().all(|result| result.mean_return >= goal),
+        }
+    }
+
+    fn checkpoint(&self) -> Result<Written, CheckpointError> {
+        let progress = self.standing.progress;
+        let path = checkpoint::save(&self.run_dir, &self.rit, &self.update.params, progress)?;
+        let weights_digest = checkpoint::digest(&self.update.params);
+        tracing::info!(path = %path.display(), env_steps = progress.env_steps, "wrote a checkpoint");
+        Ok(Written { path, progress, weights_digest })
+    }
+
+    fn finish(self) -> Result<Summary, TrainError> {
+        let Written { progress, weights_digest, .. } = self.checkpoint()?;
+        let results = self.greedy(self.config.evaluation.episodes);
+        let summary = Summary {
+            progress,
+            wall_s: self.metrics.wall_s(),
+            weights_digest,
+            evaluation: results.into_iter().map(|result| (result.task.clone(), result)).collect(),
+        };
+        let path = self.run_dir.summary();
+        let text = serde_json::to_vec_pretty(&summary).map_err(io::Error::from);
+        let written = text.and_then(|text| fs::write(&path, text));
+        written.map_err(|error| TrainError::Io { path, error })?;
+        Ok(summary)
+    }
+}
+
+/// The seed of a run's own evaluations, scheduled or asked for without one.
+pub fn evaluation_seed(config: &Config) -> RunSeed {
+    config.seed.derive("evaluation", 0)
+}
+
+fn in_words(results: &[TaskResult]) -> String {
+    let words = results.iter().map(|result| match result.win_rate {
+        Some(win_rate) => format!("{} wins {win_rate:.2}", result.task),
+        None => format!("{} {:.1}", result.task, result.mean_return),
+    });
+    words.collect::<Vec<_>>().join(", ")
+}
