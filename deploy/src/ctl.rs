@@ -97,6 +97,7 @@ fn status(status: &RunStatus, as_json: bool) -> Result<String, Failure> {
             grouped(rejected)
         ));
     }
+    lines.push(format!("{:18} process {}", "learner", status.pid));
     for actor in &status.actors {
         let (name, pid) = (&actor.name, actor.pid);
         lines.push(format!("{name:18} process {pid}, {} episodes", grouped(actor.episodes)));

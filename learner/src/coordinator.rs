@@ -367,6 +367,7 @@ impl Coordinator {
                     .collect(),
             }),
             replay_episodes: *replay_episodes as u64,
+            pid: std::process::id(),
         }
     }
 

@@ -1,4 +1,5 @@
-//! Real processes, killed at bad moments. Tests named `child_…` are the other processes of these tests.
+//! Real processes, killed at bad moments. Tests named `child_…` are the other processes of these tests; by
+//! themselves they do nothing.
 
 #![allow(clippy::unwrap_used, unreachable_pub)]
 
@@ -14,7 +15,6 @@ use std::path::{Path, PathBuf};
 const REAPED_ONE: Reaped = Reaped { removed: 1, left: 0 };
 
 #[test]
-#[ignore = "a child of other tests"]
 fn child_sends_three_and_stays() {
     let Some(space) = parents_run() else { return };
     let mut sender = EpisodeSender::open(&space, PAYLOAD_LEN, PATIENCE).unwrap();
@@ -29,7 +29,6 @@ fn child_sends_three_and_stays() {
 const LARGE: usize = 1 << 20;
 
 #[test]
-#[ignore = "a child of other tests"]
 fn child_sends_large_frames_for_ever() {
     let Some(space) = parents_run() else { return };
     let mut sender = EpisodeSender::open(&space, LARGE, PATIENCE).unwrap();
@@ -42,7 +41,6 @@ fn child_sends_large_frames_for_ever() {
 }
 
 #[test]
-#[ignore = "a child of other tests"]
 fn child_learns_nothing() {
     let Some(space) = parents_run() else { return };
     let _receiver = EpisodeReceiver::create(&space, limits(2, 2)).unwrap();

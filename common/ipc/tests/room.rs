@@ -82,7 +82,6 @@ fn a_container_with_a_small_dev_shm_gives_errors_and_no_signal() {
 }
 
 #[test]
-#[ignore = "a child of another test"]
 fn child_in_little_shared_memory() {
     let Some(space) = parents_run() else { return };
 

@@ -137,7 +137,7 @@ impl Child {
     /// Appends what makes it a child to a command that ends in this binary.
     pub fn start_with(run: &Run, test: &str, command: &mut Command) -> Self {
         let mut process = command
-            .args(["--exact", test, "--ignored", "--nocapture"])
+            .args(["--exact", test, "--nocapture"])
             .env(CHILD, run.space.directory())
             .stdin(Stdio::piped())
             .stdout(Stdio::null())

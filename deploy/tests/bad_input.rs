@@ -1,0 +1,146 @@
+//! Bad input gets one line that names the thing and the remedy, exit code 2, and overwrites nothing.
+
+mod common;
+
+use common::{RunFolder, output, rit};
+use std::{fs, path::Path, process::Stdio};
+
+/// Runs `rit` and checks exit code 2 and the one line it prints.
+#[track_caller]
+fn refused(arguments: &[&str], message: &[&str]) {
+    let output = output(arguments);
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{arguments:?}: {stderr}");
+    assert!(stderr.starts_with("error: ") && stderr.trim_end().lines().count() == 1, "{stderr}");
+    for part in message {
+        assert!(stderr.contains(part), "{part:?} in {stderr}");
+    }
+}
+
+#[test]
+fn what_is_typed_wrong_is_named() {
+    let folder = RunFolder::new();
+    let run_dir = folder.run_dir();
+    let train = |more: &[&str], message: &[&str]| {
+        refused(&[&["train", "--run-dir", run_dir.to_str().unwrap()], more].concat(), message);
+        assert!(!run_dir.exists(), "nothing was made");
+    };
+    train(&["matrx-game"], &["unknown experiment \"matrx-game\"", "did you mean matrix-game?"]);
+    train(&["no/such/file.toml"], &["no/such/file.toml", "No such file"]);
+    train(&["matrix-game", "--set", "algorithm.gamma=7"], &["algorithm.gamma = 7 is out of range 0..=1"]);
+    train(&["matrix-game", "--set", "algorithm.gama=0.9"], &["did you mean \"algorithm.gamma\"?"]);
+    train(&["matrix-game", "--set", "algorithm.gamma"], &["write --set section.key=value"]);
+    train(&["matrix-game", "--until", "luck=1"], &["write win_rate=NUMBER or mean_return=NUMBER"]);
+    train(&["matrix-game", "--actors", "0"], &["needs at least one actor"]);
+    train(&["matrix-game", "--steps", "0"], &["training.t_max = 0 is out of range"]);
+    let file = folder.path().join("mine.toml");
+    fs::write(&file, "environment.task_set = \"matrix-game\"\nnetwork.hiden_dim = 32").unwrap();
+    train(&[file.to_str().unwrap()], &["unknown key \"network.hiden_dim\"", "network.hidden_dim"]);
+}
+
+#[test]
+fn a_run_is_never_written_over() {
+    let folder = RunFolder::new();
+    let summary = folder.train(&["matrix-game", "--steps", "100"]);
+    let run_dir = folder.run_dir();
+    let run = run_dir.to_str().unwrap();
+    refused(&["train", "matrix-game", "--run-dir", run], &["already holds a run", "--run-dir"]);
+    refused(&["learner", "--new", "matrix-game", "--run-dir", run], &["already holds a run"]);
+    let on_disk = fs::read(run_dir.join("summary.json")).unwrap();
+    assert_eq!(serde_json::from_slice::<serde_json::Value>(&on_disk).unwrap(), summary);
+}
+
+#[test]
+fn what_is_no_run_is_no_run() {
+    let folder = RunFolder::new();
+    let nowhere = folder.run_dir();
+    let nowhere = nowhere.to_str().unwrap();
+    refused(&["evaluate", "--run", nowhere], &["holds no run"]);
+    refused(&["ctl", "--run", nowhere, "status"], &["holds no run"]);
+    refused(&["actor", "--run-dir", nowhere], &["holds no run"]);
+    refused(&["learner", "--run-dir", nowhere], &["holds no run"]);
+    refused(&["ctl", "status"], &["give --run DIR"]);
+}
+
+#[test]
+fn a_second_learner_and_a_second_actor_of_one_name_are_refused() {
+    let folder = RunFolder::new();
+    let mut train = folder.start(&["matrix-game", "--actors", "1"]);
+    train.wait_for("the actor", |status| !status["actors"].as_array().unwrap().is_empty());
+    let run_dir = folder.run_dir();
+    let run = run_dir.to_str().unwrap();
+    refused(
+        &["actor", "--run-dir", run, "--name", "actor-0"],
+        &["an actor named actor-0 is there already", "--name"],
+    );
+    refused(&["learner", "--run-dir", run], &["learner.sock is in use"]);
+    train.wait_for("training after all", |status| status["updates"].as_u64() > Some(0));
+}
+
+#[test]
+fn a_port_in_use_is_refused() {
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let folder = RunFolder::new();
+    let listen = format!("learner.listen=tcp:{}", taken.local_addr().unwrap());
+    let run_dir = folder.run_dir();
+    let arguments = ["train", "matrix-game", "--run-dir", run_dir.to_str().unwrap(), "--set", &listen];
+    refused(&arguments, &["is in use"]);
+}
+
+#[test]
+fn tcp_works_like_the_socket() {
+    let folder = RunFolder::new();
+    let over_tcp =
+        folder.train(&["matrix-game", "--steps", "200", "--set", "learner.listen=tcp:127.0.0.1:0"]);
+    let over_unix = RunFolder::new().train(&["matrix-game", "--steps", "200"]);
+    assert_eq!(over_tcp["weights_digest"], over_unix["weights_digest"]);
+}
+
+#[test]
+fn a_checkpoint_that_does_not_fit_is_refused() {
+    let folder = RunFolder::new();
+    folder.train(&["matrix-game", "--steps", "100"]);
+    let run_dir = folder.run_dir();
+    let run = run_dir.to_str().unwrap();
+    let weights = run_dir.join("checkpoints/latest/weights.safetensors");
+    let good = fs::read(&weights).unwrap();
+    let with = |bytes: &[u8], message: &[&str]| {
+        fs::write(&weights, bytes).unwrap();
+        refused(&["evaluate", "--run", run], message);
+    };
+    with(&good[..good.len() / 2], &["weights.safetensors", "truncated or altered"]);
+    let mut altered = good.clone();
+    *altered.last_mut().unwrap() ^= 1;
+    with(&altered, &["weights.safetensors was altered"]);
+
+    let other = RunFolder::new();
+    other.train(&["matrix-game", "--steps", "100", "--set", "network.hidden_dim=32"]);
+    let theirs = fs::read(other.run_dir().join("checkpoints/latest/weights.safetensors")).unwrap();
+    with(&theirs, &["weights of another model", "utility.embed.weight is [32, 6]"]);
+
+    fs::write(&weights, &good).unwrap();
+    assert!(output(&["evaluate", "--run", run]).status.success());
+    assert!(Path::new(run).join("config.toml").exists());
+}
+
+#[test]
+fn a_socket_path_that_is_too_long_is_named() {
+    let folder = RunFolder::new();
+    let long = folder.path().join("x".repeat(120));
+    refused(
+        &["train", "matrix-game", "--run-dir", long.to_str().unwrap()],
+        &["107", "shorter run directory"],
+    );
+}
+
+#[test]
+fn help_and_usage_are_there() {
+    for command in ["train", "learner", "actor", "evaluate", "ctl", "experiments"] {
+        let help = output(&[command, "--help"]);
+        assert!(help.status.success() && !help.stdout.is_empty(), "{command}");
+    }
+    let usage = rit(&["train"]).stderr(Stdio::null()).status().unwrap();
+    assert_eq!(usage.code(), Some(2));
+    let listed = String::from_utf8(output(&["experiments"]).stdout).unwrap();
+    assert!(listed.contains("matrix-game-vdn") && listed.contains("cooperative-navigation"), "{listed}");
+}

@@ -1,0 +1,151 @@
+//! Real processes of the `rit` binary, and what they leave behind.
+#![allow(dead_code, reason = "each test binary uses its part")]
+
+use rustix::process::{Pid, Signal, kill_process, test_kill_process};
+use serde_json::Value;
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::{Child, Command, Output, Stdio},
+    time::{Duration, Instant},
+};
+use tempfile::TempDir;
+
+/// Far beyond what any step of a test takes on a slow machine: reached only when something hangs.
+const DEADLINE: Duration = Duration::from_secs(120);
+
+/// `rit` with these arguments.
+pub fn rit(arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_rit"));
+    command.args(arguments).stdin(Stdio::null());
+    command
+}
+
+/// What became of `rit` with these arguments.
+pub fn output(arguments: &[&str]) -> Output {
+    rit(arguments).output().unwrap()
+}
+
+/// A run directory in a folder of its own.
+pub struct RunFolder {
+    folder: TempDir,
+}
+
+impl RunFolder {
+    pub fn new() -> Self {
+        Self { folder: tempfile::tempdir().unwrap() }
+    }
+
+    /// The run directory, not made yet.
+    pub fn run_dir(&self) -> PathBuf {
+        self.folder.path().join("run")
+    }
+
+    pub fn path(&self) -> &Path {
+        self.folder.path()
+    }
+
+    /// Trains to the end and returns the summary.
+    pub fn train(&self, arguments: &[&str]) -> Value {
+        self.start(arguments).finish()
+    }
+
+    /// Starts to train.
+    pub fn start(&self, arguments: &[&str]) -> Train {
+        let run_dir = self.run_dir();
+        let mut command = rit(&["train", "--json", "--run-dir", run_dir.to_str().unwrap()]);
+        let child = command.args(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        Train { child: Some(child), run_dir }
+    }
+}
+
+/// A `rit train` under way; killed with its children when dropped.
+pub struct Train {
+    child: Option<Child>,
+    run_dir: PathBuf,
+}
+
+impl Train {
+    /// `rit ctl` for this run.
+    pub fn ctl(&self, arguments: &[&str]) -> Output {
+        let run = self.run_dir.to_str().unwrap();
+        output(&[&["ctl", "--json", "--run", run], arguments].concat())
+    }
+
+    /// Asks for the status until it is as wanted.
+    pub fn wait_for(&mut self, what: &str, wanted: impl Fn(&Value) -> bool) -> Value {
+        let begun = Instant::now();
+        loop {
+            let answer = self.ctl(&["status"]);
+            if answer.status.success() {
+                let status: Value = serde_json::from_slice(&answer.stdout).unwrap();
+                if wanted(&status) {
+                    return status;
+                }
+            }
+            let over = self.child.as_mut().and_then(|child| child.try_wait().unwrap());
+            assert!(over.is_none() && begun.elapsed() < DEADLINE, "waiting for {what}: {over:?}");
+        }
+    }
+
+    /// Sends a signal to `rit train` itself.
+    pub fn signal(&self, signal: Signal) {
+        kill(self.child.as_ref().unwrap().id(), signal);
+    }
+
+    /// Waits for the end.
+    pub fn wait(mut self) -> Output {
+        self.child.take().unwrap().wait_with_output().unwrap()
+    }
+
+    /// Waits for the end, which must be a good one; returns the summary.
+    pub fn finish(self) -> Value {
+        let output = self.wait();
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success(), "{:?}: {stderr}", output.status);
+        serde_json::from_slice(&output.stdout).unwrap()
+    }
+}
+
+impl Drop for Train {
+    fn drop(&mut self) {
+        if let Some(child) = &mut self.child {
+            let _ = child.kill();
+            let _ = child.wait();
+        }
+    }
+}
+
+/// Sends a signal to a process.
+pub fn kill(pid: u32, signal: Signal) {
+    kill_process(Pid::from_raw(pid as i32).unwrap(), signal).unwrap();
+}
+
+/// Waits until a process is gone.
+pub fn wait_until_gone(pid: u32) {
+    let begun = Instant::now();
+    while test_kill_process(Pid::from_raw(pid as i32).unwrap()).is_ok() {
+        assert!(begun.elapsed() < DEADLINE, "process {pid} stays");
+        std::thread::yield_now();
+    }
+}
+
+/// The processes of a run, as its status names them: the learner first.
+pub fn pids(status: &Value) -> Vec<u32> {
+    let actors = status["actors"].as_array().unwrap().iter().map(|actor| &actor["pid"]);
+    std::iter::once(&status["pid"]).chain(actors).map(|pid| pid.as_u64().unwrap() as u32).collect()
+}
+
+/// What the run has left in shared memory: nothing, if all is well.
+pub fn shared_memory_of(run_dir: &Path) -> Vec<PathBuf> {
+    let (run_dir, _) = rit_config::RunDir::open(run_dir).unwrap();
+    let space = rit_ipc::RunSpace::new(&run_dir.shared_memory_root()).unwrap();
+    let mut left = space.leftovers().unwrap();
+    left.extend(space.directory().exists().then(|| space.directory().to_owned()));
+    left
+}
+
+/// The objects of a file of one JSON object a line.
+pub fn json_lines(path: &Path) -> Vec<Value> {
+    fs::read_to_string(path).unwrap().lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+}
