@@ -1,12 +1,12 @@
 //! What can be typed.
 
 use crate::logging::LogOptions;
-use clap::{Args, Parser, Subcommand};
-use std::path::PathBuf;
+use clap::{Args, Parser, Subcommand, ValueEnum, builder::TypedValueParser as _};
+use std::{fmt, path::PathBuf};
 
 /// Multi-task multi-agent reinforcement learning with interaction and task representations.
 #[derive(Debug, Parser)]
-#[command(version, propagate_version = true)]
+#[command(version, propagate_version = true, args_override_self = true)]
 pub struct Cli {
     #[command(subcommand)]
     pub command: Command,
@@ -26,6 +26,8 @@ pub enum Command {
     Evaluate(EvaluateOptions),
     /// Ask something of a running learner
     Ctl(CtlOptions),
+    /// Measure a part beside the machine's limit
+    Bench(BenchOptions),
     /// List the experiments that come with the program
     Experiments,
 }
@@ -56,6 +58,7 @@ pub struct ConfigOptions {
 }
 
 #[derive(Args, Debug)]
+#[command(args_override_self = true)]
 pub struct TrainOptions {
     #[command(flatten)]
     pub config: ConfigOptions,
@@ -110,6 +113,60 @@ pub struct EvaluateOptions {
     /// Print JSON
     #[arg(long)]
     pub json: bool,
+}
+
+#[derive(Args, Debug)]
+pub struct BenchOptions {
+    /// What to measure
+    #[arg(value_enum)]
+    pub kind: BenchKind,
+    /// Experiment whose sizes and tasks are used
+    #[arg(long, default_value = "cooperative-navigation")]
+    pub experiment: String,
+    /// Set any key of it; may be given again and again
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub settings: Vec<String>,
+    /// How long to measure
+    #[arg(long, default_value_t = 5.0, value_parser = positive)]
+    pub seconds: f64,
+    /// Payload of a frame, for ipc
+    #[arg(long, default_value_t = 64, value_parser = clap::value_parser!(u16).range(1..=16384).map(usize::from))]
+    pub payload_kib: usize,
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum BenchKind {
+    /// One update of the networks, batch and replay as in training
+    Learner,
+    /// Rolling episodes with the acting networks, as an actor does
+    Rollout,
+    /// The environments alone
+    Env,
+    /// Frames through shared memory
+    Ipc,
+}
+
+impl fmt::Display for BenchKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Learner => "learner",
+            Self::Rollout => "rollout",
+            Self::Env => "env",
+            Self::Ipc => "ipc",
+        })
+    }
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    let seconds: f64 = text.parse().map_err(|error| format!("{error}"))?;
+    if (0.0..=3600.0).contains(&seconds) && seconds > 0.0 {
+        Ok(seconds)
+    } else {
+        Err("must lie in 0..=3600".into())
+    }
 }
 
 #[derive(Args, Debug)]

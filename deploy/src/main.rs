@@ -1,6 +1,7 @@
 //! The `rit` binary: one program, many processes. `rit train` starts `rit learner` and several `rit actor` by
 //! executing itself; the same sub-commands are what a service unit or a cluster starts.
 
+mod bench;
 mod cli;
 mod ctl;
 mod evaluate;
@@ -45,6 +46,7 @@ async fn run(cli: Cli) -> Result<ExitCode, Failure> {
         Command::Actor(options) => processes::actor(options, logs).await,
         Command::Evaluate(options) => evaluate::run(&options),
         Command::Ctl(options) => ctl::run(options).await,
+        Command::Bench(options) => bench::run(&options),
         Command::Experiments => experiments::print(),
     }
 }

@@ -80,11 +80,16 @@ impl Process {
         Ok(())
     }
 
-    /// The last line of its log, and where the rest is.
+    /// Where it logs.
+    pub fn log(&self) -> &Path {
+        &self.log
+    }
+
+    /// The last line of its log.
     pub fn last_words(&self) -> String {
         let text = fs::read_to_string(&self.log).unwrap_or_default();
         let last = text.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("it said nothing");
-        format!("{} (log: {})", last.trim_start_matches("error: "), self.log.display())
+        last.trim_start_matches("error: ").to_owned()
     }
 
     /// Closes the lifeline and waits; kills what does not end in time.

@@ -50,12 +50,16 @@ pub async fn run(options: TrainOptions, logs: LogOptions) -> Result<ExitCode, Fa
     ));
 
     let mut run = Run { run_dir: &run_dir, logs: &logs, progress, actors: Vec::new() };
-    let ended = run.to_its_end(&config).await;
+    let ended = run.watch(&config).await;
     for actor in &mut run.actors {
         actor.end().await;
     }
     run.progress.finish();
     remove_shared_memory(&run_dir);
+    if matches!(ended, Err(Failure::Input(_))) && !run_dir.metrics().exists() {
+        // It never began: the same directory will do for the next attempt.
+        fs::remove_dir_all(run_dir.root()).map_err(Failure::runtime)?;
+    }
     match ended? {
         Ended::Finished => print_summary(&run_dir, options.json).map(|()| ExitCode::SUCCESS),
         Ended::Interrupted => {
@@ -80,7 +84,7 @@ struct Run<'a> {
 }
 
 impl Run<'_> {
-    async fn to_its_end(&mut self, config: &Config) -> Result<Ended, Failure> {
+    async fn watch(&mut self, config: &Config) -> Result<Ended, Failure> {
         let mut learner = self.start("learner", &["learner"])?;
         let mut control = self.control(&mut learner).await?;
         for index in 0..config.actors.count {
@@ -140,7 +144,9 @@ impl Run<'_> {
                 learner.end().await;
                 let seconds = START_TIMEOUT.as_secs();
                 return Err(Failure::runtime_message(format!(
-                    "the learner does not listen after {seconds} s: {}", learner.last_words()
+                    "the learner does not listen after {seconds} s: {} (log: {})",
+                    learner.last_words(),
+                    learner.log().display()
                 )));
             }
         };
@@ -163,7 +169,7 @@ impl Run<'_> {
         let words = in_words(status);
         // Exit code 2 is bad input, which is no better a second time.
         let restarted = if status.code() == Some(2) {
-            Err(Failure::input_message(format!("{} {words}: {}", actor.name(), actor.last_words())))
+            Err(Failure::input_message(format!("{}: {}", actor.name(), actor.last_words())))
         } else {
             actor.restart()
         };
@@ -202,8 +208,12 @@ async fn ask(control: &mut ControlClient<Client>) -> Result<RunStatus, tonic::St
 }
 
 fn died(learner: &Process, status: ExitStatus) -> Failure {
-    let message = format!("the learner {}: {}", in_words(status), learner.last_words());
-    if status.code() == Some(2) { Failure::input_message(message) } else { Failure::runtime_message(message) }
+    let (words, last) = (in_words(status), learner.last_words());
+    if status.code() == Some(2) {
+        Failure::input_message(last)
+    } else {
+        Failure::runtime_message(format!("the learner {words}: {last} (log: {})", learner.log().display()))
+    }
 }
 
 /// Whatever became of the children, nothing of the run stays in shared memory.

@@ -1,11 +1,12 @@
 //! `rit ctl` and `rit evaluate` against a real run.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "helpers of tests are tests too")]
 
 mod common;
 
 use common::{RunFolder, output};
 use serde_json::Value;
 
-fn json(output: std::process::Output) -> Value {
+fn json(output: &std::process::Output) -> Value {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     serde_json::from_slice(&output.stdout).unwrap()
 }
@@ -16,17 +17,17 @@ fn a_run_is_paused_evaluated_saved_resumed_and_stopped() {
     let mut train = folder.start(&["matrix-game", "--actors", "2", "--seed", "1"]);
     train.wait_for("training", |status| status["updates"].as_u64() > Some(10));
 
-    assert_eq!(json(train.ctl(&["pause"]))["state"], "paused");
+    assert_eq!(json(&train.ctl(&["pause"]))["state"], "paused");
     // What is outstanding still arrives; then everything stands.
     let still = train.wait_for("quiet", |status| {
         status["ledger"]["outstanding"] == 0 && status["ledger"]["inserted"] == status["episodes"]
     });
     let evaluation =
-        json(train.ctl(&["evaluate", "--episodes", "20", "--tasks", "game-2,game-4", "--seed", "5"]));
+        json(&train.ctl(&["evaluate", "--episodes", "20", "--tasks", "game-2,game-4", "--seed", "5"]));
     let tasks: Vec<_> = evaluation["tasks"].as_array().unwrap().iter().map(|task| &task["task"]).collect();
     assert_eq!(tasks, ["game-2", "game-4"]);
     assert_eq!(evaluation["weights_version"], still["updates"]);
-    let written = json(train.ctl(&["checkpoint"]));
+    let written = json(&train.ctl(&["checkpoint"]));
     assert_eq!(written["env_steps"], still["env_steps"]);
 
     // The same episodes with the same weights from the checkpoint: another process, the same results.
@@ -34,18 +35,18 @@ fn a_run_is_paused_evaluated_saved_resumed_and_stopped() {
     let run = run_dir.to_str().unwrap();
     let arguments =
         ["evaluate", "--run", run, "--json", "--episodes", "20", "--tasks", "game-2,game-4", "--seed", "5"];
-    let offline = json(output(&arguments));
+    let offline = json(&output(&arguments));
     assert_eq!(offline["weights_digest"], written["weights_digest"]);
     for task in evaluation["tasks"].as_array().unwrap() {
         let name = task["task"].as_str().unwrap();
         assert_eq!(offline["tasks"][name]["mean_return"], task["mean_return"]);
         assert_eq!(offline["tasks"][name]["win_rate"], task["win_rate"]);
     }
-    assert_eq!(json(train.ctl(&["status"]))["env_steps"], still["env_steps"], "a pause is a pause");
+    assert_eq!(json(&train.ctl(&["status"]))["env_steps"], still["env_steps"], "a pause is a pause");
 
-    assert_eq!(json(train.ctl(&["resume"]))["state"], "running");
+    assert_eq!(json(&train.ctl(&["resume"]))["state"], "running");
     train.wait_for("training again", |status| status["env_steps"].as_u64() > still["env_steps"].as_u64());
-    assert_eq!(json(train.ctl(&["stop"]))["state"], "stopping");
+    assert_eq!(json(&train.ctl(&["stop"]))["state"], "stopping");
     let summary = train.finish();
     assert!(summary["env_steps"].as_u64() < Some(50_000));
 }

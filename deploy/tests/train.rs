@@ -1,4 +1,5 @@
 //! `rit train` with real processes: a learner and two actors.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "helpers of tests are tests too")]
 
 mod common;
 
@@ -19,8 +20,7 @@ fn short(more: &[&str]) -> Vec<&'static str> {
 #[test]
 fn two_actors_and_a_learner_train_and_leave_a_whole_run_directory() {
     let folder = RunFolder::new();
-    let mut train = folder.start(&short(&["--actors", "2", "--steps", "1000"]));
-    // Both actors roll: pause, so that the run does not end while we look.
+    let mut train = folder.start(&short(&["--actors", "2", "--steps", "3000"]));
     let status = train.wait_for("both actors", |status| {
         let actors = status["actors"].as_array().unwrap();
         actors.len() == 2 && actors.iter().all(|actor| actor["episodes"].as_u64() > Some(0))
@@ -31,8 +31,8 @@ fn two_actors_and_a_learner_train_and_leave_a_whole_run_directory() {
     let processes = pids(&status);
 
     let summary = train.finish();
-    assert_eq!((&summary["env_steps"], &summary["episodes"]), (&Value::from(1000), &Value::from(500)));
-    assert_eq!(summary["updates"], Value::from(500 - 31), "one an episode, from the 32nd on");
+    assert_eq!((&summary["env_steps"], &summary["episodes"]), (&Value::from(3000), &Value::from(1500)));
+    assert_eq!(summary["updates"], Value::from(1500 - 31), "one an episode, from the 32nd on");
     for game in ["game-1", "game-2", "game-3", "game-4"] {
         let result = &summary["evaluation"][game];
         assert_eq!(result["episodes"], Value::from(32));
@@ -46,7 +46,7 @@ fn two_actors_and_a_learner_train_and_leave_a_whole_run_directory() {
     assert!(run_dir.join("checkpoints/latest/weights.safetensors").is_file());
     let lines = json_lines(&run_dir.join("metrics.jsonl"));
     let of_kind = |kind: &str| lines.iter().filter(|line| line["kind"] == kind).count();
-    assert_eq!((of_kind("training"), of_kind("evaluation")), (2, 1));
+    assert_eq!((of_kind("training"), of_kind("evaluation")), (6, 1));
     assert_eq!(std::fs::metadata(&run_dir).unwrap().permissions().mode() & 0o777, 0o700);
 
     assert_eq!(shared_memory_of(&run_dir), [] as [std::path::PathBuf; 0]);

@@ -171,6 +171,9 @@ pub async fn run(
     let _ = tokio::time::timeout(CLOSE_TIMEOUT, server).await;
     let _ = fs::remove_file(run_dir.address());
     receiving.await.map_err(|_| LearnerError::Panicked("receive"))??;
+    if let Err(error) = space.remove() {
+        tracing::warn!(%error, "something of the run is still in shared memory");
+    }
     Ok(training.await.map_err(|_| LearnerError::Panicked("train"))??)
 }
 

@@ -2,11 +2,11 @@
 
 use crate::{
     Before, Networks, Rit, Rows,
-    decoder::{Seen, Tables, best},
+    decoder::{Decoder, DecoderState, Seen, Tables, best},
 };
 use rand::RngExt as _;
 use rit_episode::{Policy, Turn};
-use rit_nn::{View, math};
+use rit_nn::{Scratch, View, vectorized};
 use std::sync::Arc;
 
 /// A policy of the networks, ε-greedy. Holds only what acting needs: utility network and task encoder.
@@ -18,6 +18,7 @@ pub struct Acting {
     memories: Vec<Memory>,
     rows: Rows,
     networks: Networks,
+    scratch: Scratch,
     before: Memory,
 }
 
@@ -40,6 +41,7 @@ impl Acting {
             memories: Vec::new(),
             rows: Rows::default(),
             networks: Networks::default(),
+            scratch: Scratch::default(),
             before: Memory::default(),
         };
         acting.set_params(params);
@@ -83,8 +85,8 @@ impl Policy for Acting {
     }
 
     fn act(&mut self, turns: &mut [Turn<'_>]) {
-        let (h, n_actions) = (self.rit.config.hidden_dim, self.rit.config.n_actions);
-        let Self { rit, params, tables, memories, rows, networks, before } = self;
+        let h = self.rit.config.hidden_dim;
+        let Self { rit, params, tables, memories, rows, networks, scratch, before } = self;
         rows.fill_from_turns(turns);
         before.utility.clear();
         before.task_encoder.clear();
@@ -96,7 +98,7 @@ impl Policy for Acting {
             utility: Some(View::dense(&before.utility, h)),
             task_encoder: Some(View::dense(&before.task_encoder, h)),
         };
-        rit.prepare(params, tables, rows, before, networks);
+        rit.prepare(params, tables, rows, before, networks, scratch);
         for (group, turn) in rows.groups.iter().zip(turns.iter()) {
             let states = group.queries.start * h..group.queries.end * h;
             let memory = &mut memories[turn.slot];
@@ -106,22 +108,33 @@ impl Policy for Acting {
             }
         }
 
+        choose(&rit.utility.decoder, params, tables, rows, &mut networks.utility.decoder, turns);
+    }
+}
+
+vectorized! {
+    /// Every turn's joint action, row after row, each given the actions before it.
+    fn choose<'a, 'b>(
+        decoder: &'a Decoder,
+        params: &'a [f32],
+        tables: &'a Tables,
+        rows: &'a Rows,
+        state: &'a mut DecoderState,
+        turns: &'a mut [Turn<'b>],
+    ) {
+        let n_actions = decoder.n_actions();
         let mut seen = Seen::start(n_actions);
-        let decoder = &mut networks.utility.decoder;
-        math::vectorized(|| {
-            for (group, turn) in rows.groups.iter().zip(turns.iter_mut()) {
-                seen.restart();
-                for (row, action) in group.queries.clone().zip(turn.actions.iter_mut()) {
-                    let available = &rows.available[row * n_actions..][..n_actions];
-                    let utilities = rit.utility.decoder.decide(params, tables, row, &seen, decoder);
-                    // Drawn whatever ε is, so that the stream stays in step.
-                    let explores = turn.exploration.random::<f32>() < turn.epsilon;
-                    *action =
-                        if explores { any(available, turn.exploration) } else { best(utilities, available) };
-                    seen.push(*action);
-                }
+        for (group, turn) in rows.groups.iter().zip(turns) {
+            seen.restart();
+            for (row, action) in group.queries.clone().zip(turn.actions.iter_mut()) {
+                let available = &rows.available[row * n_actions..][..n_actions];
+                let utilities = decoder.decide(params, tables, row, &seen, state);
+                // Drawn whatever ε is, so that the stream stays in step.
+                let explores = turn.exploration.random::<f32>() < turn.epsilon;
+                *action = if explores { any(available, turn.exploration) } else { best(utilities, available) };
+                seen.push(*action);
             }
-        });
+        }
     }
 }
 

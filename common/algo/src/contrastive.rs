@@ -2,24 +2,13 @@
 //! from the same task.
 
 use rand::{Rng, seq::SliceRandom as _};
-use rit_nn::{LayoutBuilder, Linear, View, ViewMut, activation, fit, math};
+use rit_nn::{LayoutBuilder, Linear, Scratch, View, ViewMut, activation, math};
 
 /// g: logit = `out`(ReLU(`hidden`([z₁ ‖ z₂]))), 2 h_z → h → 1.
 #[derive(Clone, Debug)]
 pub struct Discriminator {
     hidden: Linear,
     out: Linear,
-}
-
-/// Scratch of one part of the pairs. With P pairs:
-#[derive(Debug, Default)]
-pub struct DiscriminatorState {
-    hidden: Vec<f32>,
-    d_hidden: Vec<f32>,
-    /// The logits; then their gradient, `[P]`.
-    logits: Vec<f32>,
-    /// The pairs' gradient, `[P, 2 h_z]`.
-    pub d_pairs: Vec<f32>,
 }
 
 impl Discriminator {
@@ -30,24 +19,28 @@ impl Discriminator {
         Self { hidden, out }
     }
 
-    /// Binary cross-entropy of these pairs against their labels, summed; adds to the parameters' gradients
-    /// and fills `state.d_pairs`, both for the loss divided by `total` pairs. `pairs` (P, 2 h_z), `same` (P).
+    /// Binary cross-entropy of these pairs against their labels, summed. Writes the gradient by the pairs and
+    /// adds to the parameters' gradients, both for the loss divided by `total` pairs. `pairs` and `d_pairs`
+    /// (P, 2 h_z), `same` (P).
+    #[allow(clippy::too_many_arguments, reason = "a matrix and its companions, each named")]
     pub fn loss(
         &self,
         params: &[f32],
         pairs: View<'_>,
         same: &[bool],
         total: usize,
-        state: &mut DiscriminatorState,
+        d_pairs: ViewMut<'_>,
         grads: &mut [f32],
+        scratch: &mut Scratch,
     ) -> f64 {
         let (count, h) = (pairs.rows, self.hidden.outputs);
-        let hidden = ViewMut::dense(fit(&mut state.hidden, count * h), h);
-        self.hidden.forward_relu(params, pairs, hidden);
-        let hidden = View::dense(&state.hidden, h);
-        let logits = fit(&mut state.logits, count);
-        self.out.forward(params, hidden, ViewMut::dense(logits, 1));
+        let mut hidden = scratch.take(count * h);
+        self.hidden.forward_relu(params, pairs, ViewMut::dense(&mut hidden, h));
+        let hidden_view = View::dense(&hidden, h);
+        let mut logits = scratch.take(count);
+        self.out.forward(params, hidden_view, ViewMut::dense(&mut logits, 1));
 
+        // From here on the logits are their gradient.
         let mut loss = 0.0;
         for (logit, &same) in logits.iter_mut().zip(same) {
             let (l, y) = (f64::from(*logit), f64::from(u8::from(same)));
@@ -55,11 +48,14 @@ impl Discriminator {
             *logit = (math::sigmoid(*logit) - y as f32) / total as f32;
         }
 
-        let mut d_hidden = ViewMut::dense(fit(&mut state.d_hidden, count * h), h);
-        self.out.backward(params, hidden, View::dense(logits, 1), Some(d_hidden.reborrow()), grads);
-        activation::relu_backward(hidden, d_hidden.reborrow());
-        let d_pairs = ViewMut::dense(fit(&mut state.d_pairs, count * pairs.cols), pairs.cols);
-        self.hidden.backward(params, pairs, d_hidden.as_view(), Some(d_pairs), grads);
+        let mut d_hidden = scratch.take(count * h);
+        let to = ViewMut::dense(&mut d_hidden, h);
+        self.out.backward(params, hidden_view, View::dense(&logits, 1), Some(to), grads);
+        activation::relu_backward(hidden_view, ViewMut::dense(&mut d_hidden, h));
+        self.hidden.backward(params, pairs, View::dense(&d_hidden, h), Some(d_pairs), grads);
+        for buffer in [hidden, logits, d_hidden] {
+            scratch.give(buffer);
+        }
         loss
     }
 }
@@ -84,9 +80,10 @@ mod tests {
         let (params, pairs) = (noise(1, len), noise(2, 4 * 6));
         let same = [true, false, false, true];
         let run = |params: &[f32], pairs: &[f32]| {
-            let (mut state, mut grads) = (DiscriminatorState::default(), vec![0.0; len]);
-            let loss = discriminator.loss(params, View::dense(pairs, 6), &same, 4, &mut state, &mut grads);
-            (loss / 4.0, state.d_pairs, grads)
+            let (mut d_pairs, mut grads) = (vec![0.0; pairs.len()], vec![0.0; len]);
+            let (from, to) = (View::dense(pairs, 6), ViewMut::dense(&mut d_pairs, 6));
+            let loss = discriminator.loss(params, from, &same, 4, to, &mut grads, &mut Scratch::default());
+            (loss / 4.0, d_pairs, grads)
         };
         let (_, d_pairs, grads) = run(&params, &pairs);
         check("params", &params, &grads, |params| run(params, &pairs).0);
@@ -97,11 +94,11 @@ mod tests {
     fn an_undecided_discriminator_loses_ln_2() {
         let mut layout = LayoutBuilder::default();
         let discriminator = Discriminator::new(&mut layout, 2, 3);
-        let (mut state, mut grads) = (DiscriminatorState::default(), vec![0.0; layout.len()]);
-        let params = vec![0.0; layout.len()];
-        let pairs = noise(1, 2 * 4);
-        let pairs = View::dense(&pairs, 4);
-        let loss = discriminator.loss(&params, pairs, &[true, false], 2, &mut state, &mut grads);
+        let (params, mut grads) = (vec![0.0; layout.len()], vec![0.0; layout.len()]);
+        let (pairs, mut d_pairs) = (noise(1, 2 * 4), vec![0.0; 2 * 4]);
+        let (from, to) = (View::dense(&pairs, 4), ViewMut::dense(&mut d_pairs, 4));
+        let same = [true, false];
+        let loss = discriminator.loss(&params, from, &same, 2, to, &mut grads, &mut Scratch::default());
         assert!((loss - 2.0 * std::f64::consts::LN_2).abs() < 1e-12);
     }
 }

@@ -13,7 +13,10 @@
 
 use crate::Rows;
 use faer::Accum;
-use rit_nn::{Attention, LayoutBuilder, Linear, View, ViewMut, activation, fit, linear, math, matmul};
+use rit_nn::{
+    Attention, LayoutBuilder, Linear, Scratch, View, ViewMut, activation, fit, linear, math, matmul,
+    vectorized,
+};
 use std::ops::Range;
 
 /// Action embedding, action attention and head.
@@ -62,8 +65,6 @@ pub struct DecoderState {
     hidden: Vec<f32>,
     /// Q, `[R, A]`.
     pub utilities: Vec<f32>,
-    d_hidden: Vec<f32>,
-    d_weights: Vec<f32>,
 }
 
 /// How often each token stands before an agent: the start token and its predecessors' actions.
@@ -113,6 +114,11 @@ impl Decoder {
         let head_hidden = Linear::new(layout, &format!("{name}.head_hidden"), inputs, hidden_dim);
         let head = Linear::new(layout, &format!("{name}.head"), hidden_dim, n_actions);
         Self { action_embed, action_attention, head_hidden, head, n_actions, hidden_dim, representation_dim }
+    }
+
+    /// A.
+    pub fn n_actions(&self) -> usize {
+        self.n_actions
     }
 
     fn tokens(&self) -> usize {
@@ -166,7 +172,7 @@ impl Decoder {
     }
 
     /// From gradients of `scores`, `score_bias` and `contexts` to those of the parameters they come from.
-    fn tables_backward(&self, params: &[f32], tables: &Tables, mut d: Tables, grads: &mut [f32]) {
+    fn tables_backward(&self, params: &[f32], tables: &Tables, d: &mut Tables, grads: &mut [f32]) {
         let (h, k) = (self.hidden_dim, self.tokens());
         let attention = &self.action_attention;
         let (a, heads) = (attention.dim, attention.heads);
@@ -184,13 +190,18 @@ impl Decoder {
             let d_bias = &d.score_bias[head * k..(head + 1) * k];
             let (_, context, _) = self.head_columns(head);
 
-            matmul::dyt_x(keys, d_scores, attention.query.weight_mut(grads).rows(columns.clone()));
+            matmul::dyt_x(
+                keys,
+                d_scores,
+                attention.query.weight_mut(grads).rows(columns.clone()),
+                Accum::Add,
+            );
             let query_bias = &mut attention.query.bias_mut(grads)[columns.clone()];
             for (token, &d_bias) in d_bias.iter().enumerate() {
                 math::add_scaled(query_bias, d_bias, keys.row(token));
             }
             let weight = self.head_hidden.weight_mut(grads).columns(context.clone());
-            matmul::dyt_x(d_contexts, values, weight);
+            matmul::dyt_x(d_contexts, values, weight, Accum::Add);
 
             let mut d_keys = ViewMut::dense(&mut d.key_values, 2 * a).columns(columns.clone());
             let query = attention.query.weight(params).rows(columns.clone());
@@ -225,7 +236,8 @@ impl Decoder {
     }
 
     /// All that does not depend on predecessors, for all rows at once: the head's hidden layer without the
-    /// context, and every token's score. `history` (R, h), `representation` (R, h_z).
+    /// context and the bias, and every token's score without its bias. `history` (R, h), `representation`
+    /// (R, h_z).
     pub fn prepare(
         &self,
         params: &[f32],
@@ -238,14 +250,12 @@ impl Decoder {
         let (tau, _, z) = self.head_columns(0);
         let weight = self.head_hidden.weight(params);
         let mut base = ViewMut::dense(fit(&mut state.base, history.rows * h), h);
-        linear::fill_rows(base.reborrow(), self.head_hidden.bias(params));
-        matmul::x_wt(history, weight.columns(tau), base.reborrow(), Accum::Add);
+        matmul::x_wt(history, weight.columns(tau), base.reborrow(), Accum::Replace);
         if self.representation_dim > 0 {
             matmul::x_wt(representation, weight.columns(z), base, Accum::Add);
         }
-        let mut scores = ViewMut::dense(fit(&mut state.scores, history.rows * width), width);
-        linear::fill_rows(scores.reborrow(), &tables.score_bias);
-        matmul::x_wt(history, View::dense(&tables.scores, h), scores, Accum::Add);
+        let scores = ViewMut::dense(fit(&mut state.scores, history.rows * width), width);
+        matmul::x_wt(history, View::dense(&tables.scores, h), scores, Accum::Replace);
         fit(&mut state.weights, history.rows * width);
         fit(&mut state.hidden, history.rows * h);
         fit(&mut state.utilities, history.rows * self.n_actions);
@@ -261,20 +271,20 @@ impl Decoder {
         seen: &Seen,
         state: &'s mut DecoderState,
     ) -> &'s [f32] {
-        let (h, k) = (self.hidden_dim, self.tokens());
-        let (heads, width) = (self.action_attention.heads, tables.score_bias.len());
+        let (h, k, width) = (self.hidden_dim, self.tokens(), tables.score_bias.len());
         let head = self.head.weight(params);
-        let weights = &mut state.weights[row * width..][..width];
-        let scores = &state.scores[row * width..][..width];
+        let scores = state.scores[row * width..][..width].chunks_exact(k);
+        let weights = state.weights[row * width..][..width].chunks_exact_mut(k);
         let hidden = &mut state.hidden[row * h..][..h];
         let utilities = &mut state.utilities[row * self.n_actions..][..self.n_actions];
-        hidden.copy_from_slice(&state.base[row * h..][..h]);
-        for attention_head in 0..heads {
-            let part = attention_head * k..(attention_head + 1) * k;
-            counted_softmax(&scores[part.clone()], &seen.counts, &mut weights[part.clone()]);
-            for (&weight, context) in
-                weights[part.clone()].iter().zip(tables.contexts[part.start * h..].chunks(h))
-            {
+        let base = &state.base[row * h..][..h];
+        for (hidden, (base, bias)) in hidden.iter_mut().zip(base.iter().zip(self.head_hidden.bias(params))) {
+            *hidden = base + bias;
+        }
+        let of_head = tables.score_bias.chunks_exact(k).zip(tables.contexts.chunks_exact(k * h));
+        for ((scores, weights), (bias, contexts)) in scores.zip(weights).zip(of_head) {
+            counted_softmax(scores, bias, &seen.counts, weights);
+            for (&weight, context) in weights.iter().zip(contexts.chunks_exact(h)) {
                 if weight != 0.0 {
                     math::add_scaled(hidden, weight, context);
                 }
@@ -296,16 +306,7 @@ impl Decoder {
         actions: &[u8],
         state: &mut DecoderState,
     ) {
-        let mut seen = Seen::start(self.n_actions);
-        math::vectorized(|| {
-            for group in &rows.groups {
-                seen.restart();
-                for row in group.queries.clone() {
-                    self.decide(params, tables, row, &seen, state);
-                    seen.push(actions[row]);
-                }
-            }
-        });
+        decide_all(self, params, tables, rows, actions, state);
     }
 
     /// The greedy joint action of every group, row after row, each given the greedy actions before it;
@@ -318,17 +319,7 @@ impl Decoder {
         state: &mut DecoderState,
         actions: &mut [u8],
     ) {
-        let mut seen = Seen::start(self.n_actions);
-        math::vectorized(|| {
-            for group in &rows.groups {
-                seen.restart();
-                for row in group.queries.clone() {
-                    let available = &rows.available[row * self.n_actions..][..self.n_actions];
-                    actions[row] = best(self.decide(params, tables, row, &seen, state), available);
-                    seen.push(actions[row]);
-                }
-            }
-        });
+        decide_greedily(self, params, tables, rows, state, actions);
     }
 
     /// Takes `d_utilities` (R, A). Writes `d_history` (R, h), adds to `d_representation` (R, h_z) and to the
@@ -340,46 +331,99 @@ impl Decoder {
         tables: &Tables,
         history: View<'_>,
         representation: View<'_>,
-        state: &mut DecoderState,
+        state: &DecoderState,
         d_utilities: View<'_>,
         mut d_history: ViewMut<'_>,
         d_representation: ViewMut<'_>,
         grads: &mut [f32],
+        scratch: &mut Scratch,
     ) {
         let (h, k, width) = (self.hidden_dim, self.tokens(), tables.score_bias.len());
         let rows = history.rows;
         let hidden = View::dense(&state.hidden, h);
-        let mut d_hidden = ViewMut::dense(fit(&mut state.d_hidden, rows * h), h);
-        self.head.backward(params, hidden, d_utilities, Some(d_hidden.reborrow()), grads);
-        activation::relu_backward(hidden, d_hidden);
-        let d_hidden = View::dense(&state.d_hidden, h);
+        let mut d_hidden = scratch.take(rows * h);
+        let to = ViewMut::dense(&mut d_hidden, h);
+        self.head.backward(params, hidden, d_utilities, Some(to), grads);
+        activation::relu_backward(hidden, ViewMut::dense(&mut d_hidden, h));
+        let d_hidden_view = View::dense(&d_hidden, h);
 
-        let mut d =
-            Tables { contexts: vec![0.0; width * h], scores: vec![0.0; width * h], ..Tables::default() };
-        matmul::dyt_x(View::dense(&state.weights, width), d_hidden, ViewMut::dense(&mut d.contexts, h));
-        let mut d_scores = ViewMut::dense(fit(&mut state.d_weights, rows * width), width);
-        matmul::x_wt(d_hidden, View::dense(&tables.contexts, h), d_scores.reborrow(), Accum::Replace);
-        math::vectorized(|| {
-            for (d_weights, weights) in d_scores.data.chunks_exact_mut(k).zip(state.weights.chunks_exact(k)) {
-                softmax_backward(weights, d_weights);
-            }
-        });
-        let d_scores = View::dense(&state.d_weights, width);
-        matmul::dyt_x(d_scores, history, ViewMut::dense(&mut d.scores, h));
-        d.score_bias = vec![0.0; width];
-        linear::add_column_sums(d_scores, &mut d.score_bias);
-        matmul::dy_w(d_scores, View::dense(&tables.scores, h), d_history.reborrow(), Accum::Replace);
+        let mut d = Tables {
+            contexts: vec![0.0; width * h],
+            scores: vec![0.0; width * h],
+            score_bias: vec![0.0; width],
+            ..Tables::default()
+        };
+        let weights = View::dense(&state.weights, width);
+        matmul::dyt_x(weights, d_hidden_view, ViewMut::dense(&mut d.contexts, h), Accum::Add);
+        let mut d_scores = scratch.take(rows * width);
+        let to = ViewMut::dense(&mut d_scores, width);
+        matmul::x_wt(d_hidden_view, View::dense(&tables.contexts, h), to, Accum::Replace);
+        for (d_weights, weights) in d_scores.chunks_exact_mut(k).zip(state.weights.chunks_exact(k)) {
+            softmax_backward(weights, d_weights);
+        }
+        let d_scores_view = View::dense(&d_scores, width);
+        matmul::dyt_x(d_scores_view, history, ViewMut::dense(&mut d.scores, h), Accum::Add);
+        linear::add_column_sums(d_scores_view, &mut d.score_bias);
+        matmul::dy_w(d_scores_view, View::dense(&tables.scores, h), d_history.reborrow(), Accum::Replace);
 
         let (tau, _, z) = self.head_columns(0);
         let weight = self.head_hidden.weight(params);
-        matmul::dy_w(d_hidden, weight.columns(tau.clone()), d_history, Accum::Add);
-        matmul::dyt_x(d_hidden, history, self.head_hidden.weight_mut(grads).columns(tau));
+        matmul::dy_w(d_hidden_view, weight.columns(tau.clone()), d_history, Accum::Add);
+        matmul::dyt_x(d_hidden_view, history, self.head_hidden.weight_mut(grads).columns(tau), Accum::Add);
         if self.representation_dim > 0 {
-            matmul::dy_w(d_hidden, weight.columns(z.clone()), d_representation, Accum::Add);
-            matmul::dyt_x(d_hidden, representation, self.head_hidden.weight_mut(grads).columns(z));
+            matmul::dy_w(d_hidden_view, weight.columns(z.clone()), d_representation, Accum::Add);
+            matmul::dyt_x(
+                d_hidden_view,
+                representation,
+                self.head_hidden.weight_mut(grads).columns(z),
+                Accum::Add,
+            );
         }
-        linear::add_column_sums(d_hidden, self.head_hidden.bias_mut(grads));
-        self.tables_backward(params, tables, d, grads);
+        linear::add_column_sums(d_hidden_view, self.head_hidden.bias_mut(grads));
+        self.tables_backward(params, tables, &mut d, grads);
+        scratch.give(d_hidden);
+        scratch.give(d_scores);
+    }
+}
+
+vectorized! {
+    fn decide_all<'a>(
+        decoder: &'a Decoder,
+        params: &'a [f32],
+        tables: &'a Tables,
+        rows: &'a Rows,
+        actions: &'a [u8],
+        state: &'a mut DecoderState,
+    ) {
+        let mut seen = Seen::start(decoder.n_actions);
+        for group in &rows.groups {
+            seen.restart();
+            for row in group.queries.clone() {
+                decoder.decide(params, tables, row, &seen, state);
+                seen.push(actions[row]);
+            }
+        }
+    }
+}
+
+vectorized! {
+    fn decide_greedily<'a>(
+        decoder: &'a Decoder,
+        params: &'a [f32],
+        tables: &'a Tables,
+        rows: &'a Rows,
+        state: &'a mut DecoderState,
+        actions: &'a mut [u8],
+    ) {
+        let mut seen = Seen::start(decoder.n_actions);
+        for group in &rows.groups {
+            seen.restart();
+            for row in group.queries.clone() {
+                let available = &rows.available[row * decoder.n_actions..][..decoder.n_actions];
+                actions[row] = best(decoder.decide(params, tables, row, &seen, state), available);
+                seen.push(actions[row]);
+            }
+        }
     }
 }
 
@@ -400,18 +444,19 @@ pub fn best(utilities: &[f32], available: &[u8]) -> u8 {
     best.map_or(0, |(action, _)| action as u8)
 }
 
-/// Softmax over tokens that stand `counts` times each: weight = count · e^score / Σ.
+/// Softmax over tokens that stand `counts` times each: weight = count · e^(score + bias) / Σ.
 #[inline(always)]
-fn counted_softmax(scores: &[f32], counts: &[f32], weights: &mut [f32]) {
+fn counted_softmax(scores: &[f32], bias: &[f32], counts: &[f32], weights: &mut [f32]) {
     let mut largest = f32::NEG_INFINITY;
-    for (&score, &count) in scores.iter().zip(counts) {
+    for ((weight, (&score, &bias)), &count) in weights.iter_mut().zip(scores.iter().zip(bias)).zip(counts) {
+        *weight = score + bias;
         if count > 0.0 {
-            largest = largest.max(score);
+            largest = largest.max(*weight);
         }
     }
     let mut total = 0.0;
-    for ((weight, &score), &count) in weights.iter_mut().zip(scores).zip(counts) {
-        *weight = if count > 0.0 { count * math::exp(score - largest) } else { 0.0 };
+    for (weight, &count) in weights.iter_mut().zip(counts) {
+        *weight = if count > 0.0 { count * math::exp(*weight - largest) } else { 0.0 };
         total += *weight;
     }
     // The start token is always seen, so the total is not zero.

@@ -3,9 +3,9 @@
 
 use crate::Rows;
 use rit_nn::{
-    Attention, LayoutBuilder, Linear, View, ViewMut, activation,
-    attention::{AttentionState, Visible},
-    fit, math,
+    Attention, LayoutBuilder, Linear, Scratch, View, ViewMut, activation,
+    attention::{AttentionState, Group, Visible},
+    fit, math, vectorized,
 };
 
 /// x = ReLU(`embed`(entities)), d → h, and [x_k ‖ `attention`(x_k over the entities it sees)], h + a.
@@ -20,13 +20,9 @@ pub struct Encoder {
 pub struct EncoderState {
     /// x, `[E, h]`.
     x: Vec<f32>,
-    /// The agents' rows of x, `[R, h]`.
-    queries: Vec<f32>,
     attention: AttentionState,
     /// [x_k ‖ attention], `[R, h + a]`.
     pub encoded: Vec<f32>,
-    d_x: Vec<f32>,
-    d_queries: Vec<f32>,
 }
 
 impl Encoder {
@@ -55,53 +51,77 @@ impl Encoder {
         self.embed.outputs + self.attention.dim
     }
 
+    /// An encoded row's parts: x_k (R, h) and the attention's output (R, a).
+    pub fn split<'a>(&self, encoded: View<'a>) -> (View<'a>, View<'a>) {
+        let h = self.hidden_dim();
+        (encoded.columns(0..h), encoded.columns(h..self.width()))
+    }
+
     /// Fills `state.encoded`.
     pub fn forward(&self, params: &[f32], rows: &Rows, visible: Visible<'_>, state: &mut EncoderState) {
         let (h, width) = (self.hidden_dim(), self.width());
         let x = fit(&mut state.x, rows.entity_rows() * h);
         self.embed.forward_relu(params, rows.entities(), ViewMut::dense(x, h));
-        let queries = fit(&mut state.queries, rows.agent_rows() * h);
         let encoded = fit(&mut state.encoded, rows.agent_rows() * width);
         for group in &rows.groups {
             for (agent, entity) in group.queries.clone().zip(group.keys.clone()) {
-                let x = &state.x[entity * h..][..h];
-                queries[agent * h..][..h].copy_from_slice(x);
-                encoded[agent * width..][..h].copy_from_slice(x);
+                encoded[agent * width..][..h].copy_from_slice(&state.x[entity * h..][..h]);
             }
         }
-        let (queries, keys) = (View::dense(queries, h), View::dense(&state.x, h));
+        let queries = View::dense(encoded, width).columns(0..h);
+        self.attention.project(params, queries, View::dense(&state.x, h), &mut state.attention);
         let out = ViewMut::dense(encoded, width).columns(h..width);
-        self.attention.forward(params, queries, keys, &rows.groups, visible, &mut state.attention, out);
+        self.attention.attend(&rows.groups, visible, &mut state.attention, out);
     }
 
-    /// Takes `d_encoded` (R, h + a) and adds to the parameters' gradients.
+    /// Takes the gradients by the attention's output, `d_attended` (R, a), and by the agents' own x where
+    /// that is used, `d_agents` (R, h); adds to the parameters' gradients.
+    #[allow(clippy::too_many_arguments, reason = "a matrix and its companions, each named")]
     pub fn backward(
         &self,
         params: &[f32],
         rows: &Rows,
         state: &mut EncoderState,
-        d_encoded: View<'_>,
+        d_attended: View<'_>,
+        d_agents: Option<View<'_>>,
         grads: &mut [f32],
+        scratch: &mut Scratch,
     ) {
         let (h, width) = (self.hidden_dim(), self.width());
-        let queries = View::dense(&state.queries, h);
-        let d_queries = ViewMut::dense(fit(&mut state.d_queries, rows.agent_rows() * h), h);
-        let d_x = ViewMut::dense(fit(&mut state.d_x, rows.entity_rows() * h), h);
-        let keys = View::dense(&state.x, h);
-        let d_out = d_encoded.columns(h..width);
-        let attention = &mut state.attention;
-        self.attention.backward(params, queries, keys, &rows.groups, attention, d_out, d_queries, d_x, grads);
-        // An agent's x is a key, a query and a part of its encoded row.
-        math::vectorized(|| {
-            for group in &rows.groups {
-                for (agent, entity) in group.queries.clone().zip(group.keys.clone()) {
-                    let d_x = &mut state.d_x[entity * h..][..h];
-                    math::add_scaled(d_x, 1.0, &state.d_queries[agent * h..][..h]);
-                    math::add_scaled(d_x, 1.0, &d_encoded.row(agent)[..h]);
-                }
+        let mut d_queries = scratch.take(rows.agent_rows() * h);
+        let mut d_x = scratch.take(rows.entity_rows() * h);
+        self.attention.backward(
+            params,
+            View::dense(&state.encoded, width).columns(0..h),
+            View::dense(&state.x, h),
+            &rows.groups,
+            &mut state.attention,
+            d_attended,
+            ViewMut::dense(&mut d_queries, h),
+            ViewMut::dense(&mut d_x, h),
+            grads,
+            scratch,
+        );
+        // An agent's x is a key, a query and, maybe, of use by itself.
+        add_to_agents(&rows.groups, View::dense(&d_queries, h), &mut d_x);
+        if let Some(d_agents) = d_agents {
+            add_to_agents(&rows.groups, d_agents, &mut d_x);
+        }
+        activation::relu_backward(View::dense(&state.x, h), ViewMut::dense(&mut d_x, h));
+        self.embed.backward_params(rows.entities(), View::dense(&d_x, h), grads);
+        scratch.give(d_queries);
+        scratch.give(d_x);
+    }
+}
+
+vectorized! {
+    /// Adds agents' rows to those of the entities they are.
+    fn add_to_agents<'a>(groups: &'a [Group], of_agents: View<'a>, d_x: &'a mut [f32]) {
+        let h = of_agents.cols;
+        for group in groups {
+            for (agent, entity) in group.queries.clone().zip(group.keys.clone()) {
+                math::add_scaled(&mut d_x[entity * h..][..h], 1.0, of_agents.row(agent));
             }
-        });
-        activation::relu_backward(View::dense(&state.x, h), ViewMut::dense(&mut state.d_x, h));
-        self.embed.backward_params(rows.entities(), View::dense(&state.d_x, h), grads);
+        }
     }
 }

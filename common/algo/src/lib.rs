@@ -21,5 +21,5 @@ pub mod utility;
 
 pub use acting::Acting;
 pub use rit::{Before, ConfigError, Mixing, Networks, Rit, RitConfig, TaskRepresentations};
-pub use rows::{Rows, Step};
+pub use rows::{Rows, Step, TerminalStates};
 pub use update::{Losses, Update, UpdateConfig};

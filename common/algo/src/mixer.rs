@@ -11,10 +11,11 @@ use crate::{
     encoder::{Encoder, EncoderState},
     rit::RitConfig,
 };
-use faer::Accum;
 use rit_nn::{
-    LayoutBuilder, Linear, View, ViewMut, activation, activation::elu, activation::elu_slope,
-    attention::Visible, fit, math, matmul,
+    LayoutBuilder, Linear, Scratch, View, ViewMut, activation,
+    activation::{elu, elu_slope},
+    attention::{Group, Visible},
+    fit, linear, math, vectorized,
 };
 use std::ops::Range;
 
@@ -38,7 +39,7 @@ pub struct MixerState {
     encoder: EncoderState,
     /// c, `[R, h + h_z]`.
     context: Vec<f32>,
-    /// ReLU'd w1_hidden, w2_hidden, b2_hidden, and b1, `[R, 2y + 2x]`; backward leaves its gradient here.
+    /// ReLU'd w1_hidden, w2_hidden, b2_hidden, and b1, `[R, 2y + 2x]`.
     hyper: Vec<f32>,
     /// `w1`'s output, signed, `[R, x]`; backward leaves its gradient here.
     w1: Vec<f32>,
@@ -52,10 +53,6 @@ pub struct MixerState {
     hidden: Vec<f32>,
     /// Q_total, `[G]`.
     pub q_total: Vec<f32>,
-    d_means: Vec<f32>,
-    d_hyper: Vec<f32>,
-    d_context: Vec<f32>,
-    d_encoded: Vec<f32>,
 }
 
 impl Mixer {
@@ -100,8 +97,7 @@ impl Mixer {
         let (h, x, y) = (self.out.outputs, self.mixing_dim(), self.w1.inputs);
         let (agents, groups) = (rows.agent_rows(), rows.groups.len());
         self.encoder.forward(params, rows, Visible::All, &mut state.encoder);
-        let attended = View::dense(&state.encoder.encoded, self.encoder.width())
-            .columns(self.encoder.hidden_dim()..self.encoder.width());
+        let (_, attended) = self.encoder.split(View::dense(&state.encoder.encoded, self.encoder.width()));
         let width = self.hyper.inputs;
         let mut context = ViewMut::dense(fit(&mut state.context, agents * width), width);
         for row in 0..representation.rows {
@@ -118,39 +114,14 @@ impl Mixer {
 
         let mean_width = y + 2 * x;
         let means = fit(&mut state.means, groups * mean_width);
-        means.fill(0.0);
-        math::vectorized(|| {
-            for (group, means) in rows.groups.iter().zip(means.chunks_exact_mut(mean_width)) {
-                let share = 1.0 / group.queries.len() as f32;
-                for row in group.queries.clone() {
-                    math::add_scaled(means, share, &state.hyper[row * outputs + y..][..mean_width]);
-                }
-            }
-        });
+        average(&rows.groups, View::dense(&state.hyper, outputs).columns(y..outputs), means);
         let (w2_hidden, b2_hidden, b1) = self.mean_columns();
         let means = View::dense(means, mean_width);
         self.w2.forward(params, means.columns(w2_hidden), ViewMut::dense(fit(&mut state.w2, groups * x), x));
         self.b2.forward(params, means.columns(b2_hidden), ViewMut::dense(fit(&mut state.b2, groups), 1));
-
-        let hidden = fit(&mut state.hidden, groups * x);
-        let q_total = fit(&mut state.q_total, groups);
-        math::vectorized(|| {
-            for (at, group) in rows.groups.iter().enumerate() {
-                let hidden = &mut hidden[at * x..][..x];
-                hidden.copy_from_slice(&means.row(at)[b1.clone()]);
-                for row in group.queries.clone() {
-                    for (hidden, w1) in hidden.iter_mut().zip(&state.w1[row * x..][..x]) {
-                        *hidden += q[row] * w1.abs();
-                    }
-                }
-                let mut total = state.b2[at];
-                for (hidden, w2) in hidden.iter_mut().zip(&state.w2[at * x..][..x]) {
-                    *hidden = elu(*hidden);
-                    total += *hidden * w2.abs();
-                }
-                q_total[at] = total;
-            }
-        });
+        let MixerState { w1, w2, b2, hidden, q_total, .. } = state;
+        let (hidden, q_total) = (fit(hidden, groups * x), fit(q_total, groups));
+        mix(&rows.groups, q, [w1, w2, b2], means.columns(b1), hidden, q_total);
     }
 
     /// Takes `d_total` (G). Writes `d_q` (R), adds to `d_representation` (R, h_z) and to the parameters'
@@ -164,74 +135,140 @@ impl Mixer {
         state: &mut MixerState,
         d_total: &[f32],
         d_q: &mut [f32],
-        mut d_representation: ViewMut<'_>,
+        d_representation: ViewMut<'_>,
         grads: &mut [f32],
+        scratch: &mut Scratch,
     ) {
         let (h, x, y) = (self.out.outputs, self.mixing_dim(), self.w1.inputs);
         let (agents, groups) = (rows.agent_rows(), rows.groups.len());
         let (width, outputs, mean_width) = (self.hyper.inputs, self.hyper.outputs, y + 2 * x);
         let (w2_hidden, b2_hidden, b1) = self.mean_columns();
-        let d_means = fit(&mut state.d_means, groups * mean_width);
-        math::vectorized(|| {
-            for (at, group) in rows.groups.iter().enumerate() {
-                let d_b1 = &mut d_means[at * mean_width..][b1.clone()];
-                let (hidden, w2) = (&state.hidden[at * x..][..x], &mut state.w2[at * x..][..x]);
-                for i in 0..x {
-                    d_b1[i] = d_total[at] * w2[i].abs() * elu_slope(hidden[i]);
-                    w2[i] = d_total[at] * hidden[i] * slope_of_abs(w2[i]);
-                }
-                for row in group.queries.clone() {
-                    let w1 = &mut state.w1[row * x..][..x];
-                    let mut sum = 0.0;
-                    for i in 0..x {
-                        sum += d_b1[i] * w1[i].abs();
-                        w1[i] = d_b1[i] * q[row] * slope_of_abs(w1[i]);
-                    }
-                    d_q[row] = sum;
-                }
-            }
-        });
+        let mut d_means = scratch.take(groups * mean_width);
+        let d_b1 = ViewMut::dense(&mut d_means, mean_width).columns(b1);
+        mix_backward(&rows.groups, q, &state.hidden, [&mut state.w1, &mut state.w2], d_total, d_q, d_b1);
         let means = View::dense(&state.means, mean_width);
         let d_w2 = View::dense(&state.w2, x);
-        let mut d_means = ViewMut::dense(d_means, mean_width);
-        let to = d_means.reborrow().columns(w2_hidden.clone());
+        let to = ViewMut::dense(&mut d_means, mean_width).columns(w2_hidden.clone());
         self.w2.backward(params, means.columns(w2_hidden), d_w2, Some(to), grads);
-        let to = d_means.reborrow().columns(b2_hidden.clone());
+        let to = ViewMut::dense(&mut d_means, mean_width).columns(b2_hidden.clone());
         self.b2.backward(params, means.columns(b2_hidden), View::dense(d_total, 1), Some(to), grads);
 
         let hyper = View::dense(&state.hyper, outputs);
-        let mut d_hyper = ViewMut::dense(fit(&mut state.d_hyper, agents * outputs), outputs);
-        let to = d_hyper.reborrow().columns(0..y);
+        let mut d_hyper = scratch.take(agents * outputs);
+        let to = ViewMut::dense(&mut d_hyper, outputs).columns(0..y);
         self.w1.backward(params, hyper.columns(0..y), View::dense(&state.w1, x), Some(to), grads);
-        for (at, group) in rows.groups.iter().enumerate() {
+        let to = ViewMut::dense(&mut d_hyper, outputs).columns(y..outputs);
+        average_backward(&rows.groups, View::dense(&d_means, mean_width), to);
+        scratch.give(d_means);
+        let relued = 0..2 * y + x;
+        let d_relued = ViewMut::dense(&mut d_hyper, outputs).columns(relued.clone());
+        activation::relu_backward(hyper.columns(relued), d_relued);
+        let mut d_context = scratch.take(agents * width);
+        let to = Some(ViewMut::dense(&mut d_context, width));
+        let context = View::dense(&state.context, width);
+        self.hyper.backward(params, context, View::dense(&d_hyper, outputs), to, grads);
+        scratch.give(d_hyper);
+
+        let d_context_view = View::dense(&d_context, width);
+        if d_representation.cols > 0 {
+            linear::add(d_representation, d_context_view.columns(h..width));
+        }
+        let (_, attended) = self.encoder.split(View::dense(&state.encoder.encoded, self.encoder.width()));
+        let d_out = d_context_view.columns(0..h);
+        let mut d_attended = scratch.take(agents * self.out.inputs);
+        let to = Some(ViewMut::dense(&mut d_attended, self.out.inputs));
+        self.out.backward(params, attended, d_out, to, grads);
+        scratch.give(d_context);
+        // x_k itself is a query here and nothing more.
+        let from = View::dense(&d_attended, self.out.inputs);
+        self.encoder.backward(params, rows, &mut state.encoder, from, None, grads, scratch);
+        scratch.give(d_attended);
+    }
+}
+
+vectorized! {
+    /// Each group's mean over its agents.
+    fn average<'a>(groups: &'a [Group], rows: View<'a>, means: &'a mut [f32]) {
+        means.fill(0.0);
+        for (group, mean) in groups.iter().zip(means.chunks_exact_mut(rows.cols)) {
             let share = 1.0 / group.queries.len() as f32;
             for row in group.queries.clone() {
-                for (to, d_mean) in d_hyper.row(row)[y..].iter_mut().zip(d_means.row(at)) {
-                    *to = share * *d_mean;
+                math::add_scaled(mean, share, rows.row(row));
+            }
+        }
+    }
+}
+
+vectorized! {
+    /// Each agent's share of its group's gradient.
+    fn average_backward<'a>(groups: &'a [Group], d_means: View<'a>, d_rows: ViewMut<'a>) {
+        for (at, group) in groups.iter().enumerate() {
+            let share = 1.0 / group.queries.len() as f32;
+            for row in group.queries.clone() {
+                for (d_row, d_mean) in d_rows.row(row).iter_mut().zip(d_means.row(at)) {
+                    *d_row = share * d_mean;
                 }
             }
         }
-        let relued = 0..2 * y + x;
-        activation::relu_backward(hyper.columns(relued.clone()), d_hyper.reborrow().columns(relued));
-        let d_context = ViewMut::dense(fit(&mut state.d_context, agents * width), width);
-        let context = View::dense(&state.context, width);
-        self.hyper.backward(params, context, d_hyper.as_view(), Some(d_context), grads);
+    }
+}
 
-        let d_context = View::dense(&state.d_context, width);
-        for row in 0..d_representation.rows {
-            math::add_scaled(d_representation.row(row), 1.0, &d_context.row(row)[h..]);
+vectorized! {
+    /// Equation 15 for every group, from W₁, w₂ (both still signed) and b₂ in `weights`, and b₁.
+    fn mix<'a>(
+        groups: &'a [Group],
+        q: &'a [f32],
+        weights: [&'a [f32]; 3],
+        b1: View<'a>,
+        hidden: &'a mut [f32],
+        q_total: &'a mut [f32],
+    ) {
+        let ([w1, w2, b2], x) = (weights, b1.cols);
+        for (at, group) in groups.iter().enumerate() {
+            let hidden = &mut hidden[at * x..][..x];
+            hidden.copy_from_slice(b1.row(at));
+            for row in group.queries.clone() {
+                for (hidden, w1) in hidden.iter_mut().zip(&w1[row * x..][..x]) {
+                    *hidden += q[row] * w1.abs();
+                }
+            }
+            let mut total = b2[at];
+            for (hidden, w2) in hidden.iter_mut().zip(&w2[at * x..][..x]) {
+                *hidden = elu(*hidden);
+                total += *hidden * w2.abs();
+            }
+            q_total[at] = total;
         }
-        let (from, width) = (self.encoder.hidden_dim(), self.encoder.width());
-        let attended = View::dense(&state.encoder.encoded, width).columns(from..width);
-        // x_k itself is a query here and nothing more: its columns get no gradient of their own.
-        let d_encoded = fit(&mut state.d_encoded, agents * width);
-        d_encoded.fill(0.0);
-        let d_out = d_context.columns(0..h);
-        self.out.backward_params(attended, d_out, grads);
-        let to = ViewMut::dense(d_encoded, width).columns(from..width);
-        matmul::dy_w(d_out, self.out.weight(params), to, Accum::Replace);
-        let d_encoded = View::dense(&state.d_encoded, width);
-        self.encoder.backward(params, rows, &mut state.encoder, d_encoded, grads);
+    }
+}
+
+vectorized! {
+    /// Leaves the gradients by W₁ and w₂ in `weights`, writes those by q and by b₁.
+    fn mix_backward<'a>(
+        groups: &'a [Group],
+        q: &'a [f32],
+        hidden: &'a [f32],
+        weights: [&'a mut [f32]; 2],
+        d_total: &'a [f32],
+        d_q: &'a mut [f32],
+        d_b1: ViewMut<'a>,
+    ) {
+        let ([w1, w2], x) = (weights, d_b1.cols);
+        for (at, group) in groups.iter().enumerate() {
+            let d_b1 = d_b1.row(at);
+            let of_group = w2[at * x..][..x].iter_mut().zip(&hidden[at * x..][..x]);
+            for (d_b1, (w2, &hidden)) in d_b1.iter_mut().zip(of_group) {
+                *d_b1 = d_total[at] * w2.abs() * elu_slope(hidden);
+                *w2 = d_total[at] * hidden * slope_of_abs(*w2);
+            }
+            for row in group.queries.clone() {
+                let w1 = &mut w1[row * x..][..x];
+                d_q[row] = w1.iter().zip(&*d_b1).map(|(w1, d)| w1.abs() * d).sum();
+                for (w1, d) in w1.iter_mut().zip(&*d_b1) {
+                    *w1 = d * q[row] * slope_of_abs(*w1);
+                }
+            }
+        }
     }
 }
 

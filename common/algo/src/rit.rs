@@ -8,7 +8,7 @@ use crate::{
     task_encoder::{TaskEncoder, TaskEncoderState},
     utility::{Utility, UtilityState},
 };
-use rit_nn::{Layout, LayoutBuilder, View};
+use rit_nn::{Layout, LayoutBuilder, Scratch, View};
 use std::ops::Range;
 
 /// Sizes and parts of a model.
@@ -169,12 +169,13 @@ impl Rit {
         rows: &Rows,
         before: Before<'_>,
         state: &mut Networks,
+        scratch: &mut Scratch,
     ) {
         if let Some(task_encoder) = &self.task_encoder {
-            task_encoder.forward(params, rows, before.task_encoder, &mut state.task_encoder);
+            task_encoder.forward(params, rows, before.task_encoder, &mut state.task_encoder, scratch);
         }
         let z = self.representation(&state.task_encoder);
-        self.utility.forward(params, tables, rows, before.utility, z, &mut state.utility);
+        self.utility.forward(params, tables, rows, before.utility, z, &mut state.utility, scratch);
     }
 
     /// From prepared decisions to Q_total (groups) of these actions (agent rows), left in `state.q_total`.

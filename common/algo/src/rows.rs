@@ -1,10 +1,11 @@
 //! The rows of a batch that exist, in the order the networks work on them.
 //!
 //! Padding never reaches the networks. Episodes of a batch are ordered longest first and laid out time-major:
-//! all rows of time 0, then of time 1, …, where time T of an episode is its bootstrap state. So the rows of a
-//! time are a prefix of those of the time before, and one product serves all times where nothing is recurrent.
+//! all rows of time 0, then of time 1, …. Time T of an episode is its bootstrap state, which is there only where a
+//! target needs it. So the rows of a time are a prefix of those of the time before, and one product serves all
+//! times where nothing is recurrent.
 
-use rit_episode::{Episode, Turn};
+use rit_episode::{End, Episode, Turn};
 use rit_nn::{View, attention::Group};
 
 /// One (episode, time) of a batch: a group of agents that decide together.
@@ -54,28 +55,42 @@ pub struct Rows {
     places: Vec<usize>,
 }
 
+/// What becomes of the states behind the last step of episodes that terminated: no target needs them.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum TerminalStates {
+    /// They get no rows.
+    #[default]
+    LeftOut,
+    /// They get rows like any other: for comparison with implementations that work on them.
+    Kept,
+}
+
 impl Rows {
     /// Lays out a batch of episodes.
-    pub fn of_episodes(episodes: &[&Episode]) -> Self {
+    pub fn of_episodes(episodes: &[&Episode], terminal: TerminalStates) -> Self {
         let mut rows = Self::default();
-        rows.fill_from_episodes(episodes);
+        rows.fill_from_episodes(episodes, terminal);
         rows
     }
 
     /// Lays out a batch of episodes, keeping memory.
-    pub fn fill_from_episodes(&mut self, episodes: &[&Episode]) {
+    pub fn fill_from_episodes(&mut self, episodes: &[&Episode], terminal: TerminalStates) {
         self.clear();
+        let states = |index: usize| {
+            let left_out = terminal == TerminalStates::LeftOut && episodes[index].end == End::Terminated;
+            episodes[index].steps() + usize::from(!left_out)
+        };
         // A stable order: equal lengths keep the batch's order.
         let mut order: Vec<usize> = (0..episodes.len()).collect();
-        order.sort_by_key(|&index| std::cmp::Reverse(episodes[index].steps()));
+        order.sort_by_key(|&index| std::cmp::Reverse(states(index)));
         self.places.resize(episodes.len(), 0);
         for (place, &index) in order.iter().enumerate() {
             self.places[index] = place;
         }
-        let longest = order.first().map_or(0, |&index| episodes[index].steps() + 1);
+        let longest = order.first().map_or(0, |&index| states(index));
         for time in 0..longest {
             self.begin_time();
-            for &index in order.iter().take_while(|&&index| episodes[index].steps() >= time) {
+            for &index in order.iter().take_while(|&&index| states(index) > time) {
                 self.push_episode_step(index, time, episodes[index]);
             }
         }
@@ -124,10 +139,12 @@ impl Rows {
         self.group_times[time] + self.places[episode]
     }
 
-    /// The group of the same episode one step later. Only for filled groups: every one of them has it.
-    pub fn next_group(&self, group: usize) -> usize {
+    /// The group of the same episode one step later, where it has one.
+    pub fn next_group(&self, group: usize) -> Option<usize> {
         let Step { episode, time, .. } = self.steps[group];
-        self.group_of(episode, time + 1)
+        let next = self.group_times.get(time + 1)? + self.places[episode];
+        let is_there = next < *self.group_times.get(time + 2)?;
+        is_there.then_some(next)
     }
 
     /// The filled agent rows in the order (episode of the batch, time, agent): the order in which the
@@ -166,7 +183,7 @@ impl Rows {
     fn push_episode_step(&mut self, index: usize, time: usize, episode: &Episode) {
         let (n, m, steps) = (episode.n_agents, episode.n_entities, episode.steps());
         let filled = time < steps;
-        let terminated = time + 1 == steps && episode.end == rit_episode::End::Terminated;
+        let terminated = time + 1 == steps && episode.end == End::Terminated;
         let reward = if filled { episode.rewards[time] } else { 0.0 };
         let step = Step { episode: index, time, reward, filled, terminated, task: episode.task };
         let d = episode.entities.len() / ((steps + 1) * m);
@@ -203,7 +220,6 @@ impl Rows {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use rit_episode::End;
 
     /// An episode whose every number says where it belongs: entity feature = 100 · task + 10 · time + row.
     fn episode(task: usize, n: usize, m: usize, steps: usize, end: End) -> Episode {
@@ -229,7 +245,7 @@ mod tests {
     fn rows_lie_time_major_longest_first() {
         let short = episode(1, 1, 2, 1, End::Truncated);
         let long = episode(2, 2, 3, 2, End::Terminated);
-        let rows = Rows::of_episodes(&[&short, &long]);
+        let rows = Rows::of_episodes(&[&short, &long], TerminalStates::Kept);
         // Time 0: long, short; time 1: long, short's bootstrap; time 2: long's bootstrap.
         assert_eq!(rows.group_times, [0, 2, 4, 5]);
         assert_eq!(rows.agent_times, [0, 3, 6, 8]);
@@ -248,9 +264,22 @@ mod tests {
         assert_eq!(rows.entities, entities.map(|x| x as f32));
         assert_eq!(rows.previous_rewards, [0.0, 0.0, 1.0, 1.0, 2.0]);
         assert_eq!(rows.others[..8], [0, 1, 1, 1, 0, 1, 0, 1]);
-        assert_eq!((rows.next_group(0), rows.next_group(1), rows.next_group(2)), (2, 3, 4));
+        let next: Vec<_> = (0..5).map(|group| rows.next_group(group)).collect();
+        assert_eq!(next, [Some(2), Some(3), Some(4), None, None]);
         // The contrastive order is the batch's: short's one row, then long's four.
         let ordered: Vec<_> = rows.filled_agent_rows().map(|(row, step)| (row, step.task)).collect();
         assert_eq!(ordered, [(2, 1), (0, 2), (1, 2), (3, 2), (4, 2)]);
+    }
+
+    #[test]
+    fn states_that_no_target_needs_are_left_out() {
+        let terminated = episode(1, 1, 2, 2, End::Terminated);
+        let truncated = episode(2, 2, 3, 1, End::Truncated);
+        let rows = Rows::of_episodes(&[&terminated, &truncated], TerminalStates::LeftOut);
+        let whose: Vec<_> = rows.steps.iter().map(|step| (step.episode, step.time, step.filled)).collect();
+        assert_eq!(whose, [(0, 0, true), (1, 0, true), (0, 1, true), (1, 1, false)]);
+        let next: Vec<_> = (0..4).map(|group| rows.next_group(group)).collect();
+        assert_eq!(next, [Some(2), Some(3), None, None]);
+        assert_eq!((rows.agent_rows(), rows.entity_rows()), (6, 10));
     }
 }

@@ -8,8 +8,11 @@ use crate::{
 };
 use faer::Accum;
 use rit_nn::{
-    Gru, LayoutBuilder, Linear, View, ViewMut, activation, attention::Visible, fit, gru::GruState, linear,
-    math, matmul,
+    Gru, LayoutBuilder, Linear, Scratch, View, ViewMut, activation,
+    attention::{Group, Visible},
+    fit,
+    gru::GruState,
+    math, matmul, vectorized,
 };
 use std::ops::Range;
 
@@ -31,14 +34,9 @@ pub struct TaskEncoderState {
     encoder: EncoderState,
     /// ReLU'd reward embeddings, `[groups, r]`: the reward is the team's, so it is embedded once per group.
     rewards: Vec<f32>,
-    /// The rewards' share of the gates, `[groups, 3h]`; backward leaves its gradient here.
-    reward_gates: Vec<f32>,
     gru: GruState,
     /// z, `[R, h_z]`.
     pub representation: Vec<f32>,
-    d_rewards: Vec<f32>,
-    d_history: Vec<f32>,
-    d_encoded: Vec<f32>,
 }
 
 impl TaskEncoder {
@@ -66,6 +64,7 @@ impl TaskEncoder {
         rows: &Rows,
         before: Option<View<'_>>,
         state: &mut TaskEncoderState,
+        scratch: &mut Scratch,
     ) {
         let (h, r) = (self.gru.hidden_dim, self.reward_embed.outputs);
         let (encoded_columns, reward_columns) = self.columns();
@@ -75,20 +74,18 @@ impl TaskEncoder {
         let groups = rows.groups.len();
         let rewards = ViewMut::dense(fit(&mut state.rewards, groups * r), r);
         self.reward_embed.forward_relu(params, View::dense(&rows.previous_rewards, 1), rewards);
-        let mut reward_gates = ViewMut::dense(fit(&mut state.reward_gates, groups * 3 * h), 3 * h);
-        linear::fill_rows(reward_gates.reborrow(), self.gru.input.bias(params));
+        let mut reward_gates = scratch.take(groups * 3 * h);
         let rewards = View::dense(&state.rewards, r);
-        matmul::x_wt(rewards, weight.columns(reward_columns), reward_gates, Accum::Add);
+        let to = ViewMut::dense(&mut reward_gates, 3 * h);
+        matmul::x_wt(rewards, weight.columns(reward_columns), to, Accum::Replace);
 
         let gates = fit(&mut state.gru.gates, rows.agent_rows() * 3 * h);
-        for (group, reward_gates) in rows.groups.iter().zip(state.reward_gates.chunks_exact(3 * h)) {
-            for row in group.queries.clone() {
-                gates[row * 3 * h..][..3 * h].copy_from_slice(reward_gates);
-            }
-        }
         let encoded = View::dense(&state.encoder.encoded, self.encoder.width());
-        matmul::x_wt(encoded, weight.columns(encoded_columns), ViewMut::dense(gates, 3 * h), Accum::Add);
-        self.gru.forward(params, &rows.agent_times, before, &mut state.gru);
+        let to = ViewMut::dense(gates, 3 * h);
+        matmul::x_wt(encoded, weight.columns(encoded_columns), to, Accum::Replace);
+        add_to_members(&rows.groups, View::dense(&reward_gates, 3 * h), gates);
+        scratch.give(reward_gates);
+        self.gru.forward(params, &rows.agent_times, before, &mut state.gru, scratch);
 
         let z = self.out.outputs;
         let representation = ViewMut::dense(fit(&mut state.representation, rows.agent_rows() * z), z);
@@ -103,43 +100,68 @@ impl TaskEncoder {
         state: &mut TaskEncoderState,
         d_representation: View<'_>,
         grads: &mut [f32],
+        scratch: &mut Scratch,
     ) {
         let (h, r, width) = (self.gru.hidden_dim, self.reward_embed.outputs, self.encoder.width());
         let (encoded_columns, reward_columns) = self.columns();
         let weight = self.gru.input.weight(params);
-        let d_history = fit(&mut state.d_history, rows.agent_rows() * h);
+        let mut d_history = scratch.take(rows.agent_rows() * h);
         let history = View::dense(&state.gru.history, h);
-        self.out.backward(params, history, d_representation, Some(ViewMut::dense(d_history, h)), grads);
-        self.gru.backward(params, &rows.agent_times, &mut state.gru, d_history, grads);
+        let to = Some(ViewMut::dense(&mut d_history, h));
+        self.out.backward(params, history, d_representation, to, grads);
+        self.gru.backward(params, &rows.agent_times, &mut state.gru, &mut d_history, grads, scratch);
+        scratch.give(d_history);
         let d_gates = View::dense(&state.gru.gates, 3 * h);
 
         // Each group's agents share one reward: their gradients meet before the products.
-        let d_reward_gates = fit(&mut state.reward_gates, rows.groups.len() * 3 * h);
-        d_reward_gates.fill(0.0);
-        math::vectorized(|| {
-            for (group, sum) in rows.groups.iter().zip(d_reward_gates.chunks_exact_mut(3 * h)) {
-                for row in group.queries.clone() {
-                    math::add_scaled(sum, 1.0, d_gates.row(row));
-                }
-            }
-        });
-        let d_reward_gates = View::dense(d_reward_gates, 3 * h);
+        let mut d_reward_gates = scratch.take_zeros(rows.groups.len() * 3 * h);
+        sum_over_members(&rows.groups, d_gates, &mut d_reward_gates);
+        let from = View::dense(&d_reward_gates, 3 * h);
         let rewards = View::dense(&state.rewards, r);
         let reward_weight = self.gru.input.weight_mut(grads).columns(reward_columns.clone());
-        matmul::dyt_x(d_reward_gates, rewards, reward_weight);
-        let mut d_rewards = ViewMut::dense(fit(&mut state.d_rewards, rows.groups.len() * r), r);
-        matmul::dy_w(d_reward_gates, weight.columns(reward_columns), d_rewards.reborrow(), Accum::Replace);
-        activation::relu_backward(rewards, d_rewards.reborrow());
+        matmul::dyt_x(from, rewards, reward_weight, Accum::Add);
+        let mut d_rewards = scratch.take(rows.groups.len() * r);
+        let to = ViewMut::dense(&mut d_rewards, r);
+        matmul::dy_w(from, weight.columns(reward_columns), to, Accum::Replace);
+        activation::relu_backward(rewards, ViewMut::dense(&mut d_rewards, r));
         let previous_rewards = View::dense(&rows.previous_rewards, 1);
-        self.reward_embed.backward_params(previous_rewards, d_rewards.as_view(), grads);
+        self.reward_embed.backward_params(previous_rewards, View::dense(&d_rewards, r), grads);
+        scratch.give(d_reward_gates);
+        scratch.give(d_rewards);
 
         let encoded = View::dense(&state.encoder.encoded, width);
         let encoded_weight = self.gru.input.weight_mut(grads).columns(encoded_columns.clone());
-        matmul::dyt_x(d_gates, encoded, encoded_weight);
-        let d_encoded = ViewMut::dense(fit(&mut state.d_encoded, rows.agent_rows() * width), width);
-        matmul::dy_w(d_gates, weight.columns(encoded_columns), d_encoded, Accum::Replace);
-        let d_encoded = View::dense(&state.d_encoded, width);
-        self.encoder.backward(params, rows, &mut state.encoder, d_encoded, grads);
+        matmul::dyt_x(d_gates, encoded, encoded_weight, Accum::Add);
+        let mut d_encoded = scratch.take(rows.agent_rows() * width);
+        let to = ViewMut::dense(&mut d_encoded, width);
+        matmul::dy_w(d_gates, weight.columns(encoded_columns), to, Accum::Replace);
+        let d_encoded_view = View::dense(&d_encoded, width);
+        let (d_agents, d_attended) = self.encoder.split(d_encoded_view);
+        self.encoder.backward(params, rows, &mut state.encoder, d_attended, Some(d_agents), grads, scratch);
+        scratch.give(d_encoded);
+    }
+}
+
+vectorized! {
+    /// rows += their group's row.
+    fn add_to_members<'a>(groups: &'a [Group], of_group: View<'a>, rows: &'a mut [f32]) {
+        let width = of_group.cols;
+        for (at, group) in groups.iter().enumerate() {
+            for row in group.queries.clone() {
+                math::add_scaled(&mut rows[row * width..][..width], 1.0, of_group.row(at));
+            }
+        }
+    }
+}
+
+vectorized! {
+    /// sums += each group's rows: the backward of [`add_to_members`].
+    fn sum_over_members<'a>(groups: &'a [Group], rows: View<'a>, sums: &'a mut [f32]) {
+        for (group, sum) in groups.iter().zip(sums.chunks_exact_mut(rows.cols)) {
+            for row in group.queries.clone() {
+                math::add_scaled(sum, 1.0, rows.row(row));
+            }
+        }
     }
 }
 

@@ -4,16 +4,16 @@
 //! their order. So the result depends on the number of shards, which is configuration, and not on threads.
 
 use crate::{
-    Before, Networks, Rit, Rows,
-    contrastive::{self, DiscriminatorState},
+    Before, Networks, Rit, Rows, TerminalStates,
+    contrastive::{self, Discriminator},
     decoder::Tables,
     td,
 };
 use rand::Rng;
 use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder, prelude::*};
 use rit_episode::Episode;
-use rit_nn::{Optimizer, OptimizerKind, View, ViewMut, optimizer};
-use std::sync::Arc;
+use rit_nn::{Optimizer, OptimizerKind, Scratch, View, ViewMut, math, optimizer, vectorized};
+use std::sync::{Arc, Mutex, PoisonError};
 
 /// Constants of the update.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -30,6 +30,8 @@ pub struct UpdateConfig {
     pub shards: usize,
     /// Threads that work on them; at least 1. Not part of the result.
     pub threads: usize,
+    /// Whether states that no target needs are worked on. Not part of the result.
+    pub terminal_states: TerminalStates,
 }
 
 /// What one update saw.
@@ -61,30 +63,55 @@ pub struct Update {
     grads: Vec<f32>,
     shards: Vec<Shard>,
     contrastive: Contrastive,
+    workers: Workers,
 }
 
 /// A part of the batch.
 #[derive(Default)]
-pub(crate) struct Shard {
-    pub(crate) rows: Rows,
-    pub(crate) online: Networks,
-    pub(crate) target: Networks,
+struct Shard {
+    rows: Rows,
+    online: Networks,
     /// The online network's greedy action of each agent row.
-    pub(crate) greedy: Vec<u8>,
+    greedy: Vec<u8>,
+    /// The target network's Q_total of the greedy joint actions, by group.
+    target_q_total: Vec<f32>,
     /// TD target of each group; 0 where not filled.
-    pub(crate) td_targets: Vec<f32>,
+    td_targets: Vec<f32>,
     /// Loss's gradient by Q_total of each group.
     d_total: Vec<f32>,
-    d_q: Vec<f32>,
-    d_utilities: Vec<f32>,
+    /// Loss's gradient by z, (agent rows, h_z): the contrastive loss adds its own before backward does.
     d_representation: Vec<f32>,
     grads: Vec<f32>,
     td_loss: f64,
+    contrastive_loss: f64,
     q_total_sum: f64,
     target_sum: f64,
 }
 
-/// Scratch of the contrastive loss, over the whole batch. With N filled agent rows:
+/// What a thread needs while it works on a shard, whichever that is.
+#[derive(Default)]
+struct Worker {
+    target: Networks,
+    scratch: Scratch,
+}
+
+/// As many workers as threads have worked at once.
+#[derive(Default)]
+struct Workers(Mutex<Vec<Worker>>);
+
+impl Workers {
+    fn with<T>(&self, work: impl FnOnce(&mut Worker) -> T) -> T {
+        // Nothing that could panic happens under the lock.
+        let idle = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let taken = idle().pop();
+        let mut worker = taken.unwrap_or_default();
+        let result = work(&mut worker);
+        idle().push(worker);
+        result
+    }
+}
+
+/// Buffers of the contrastive loss, over the whole batch. With N filled agent rows:
 #[derive(Default)]
 struct Contrastive {
     /// (shard, agent row, task) in the order (episode, step, agent).
@@ -93,8 +120,8 @@ struct Contrastive {
     inverse: Vec<usize>,
     /// [z_i ‖ z_π(i)], `[N, 2 h_z]`.
     pairs: Vec<f32>,
+    d_pairs: Vec<f32>,
     same: Vec<bool>,
-    parts: Vec<(DiscriminatorState, Vec<f32>, f64)>,
 }
 
 impl Update {
@@ -117,6 +144,7 @@ impl Update {
             grads: vec![0.0; params.len()],
             shards: (0..config.shards.max(1)).map(|_| Shard::default()).collect(),
             contrastive: Contrastive::default(),
+            workers: Workers::default(),
             rit,
             config,
             pool,
@@ -150,29 +178,31 @@ impl Update {
     ) -> Losses {
         let filled: usize = batch.iter().map(|episode| episode.steps()).sum();
         let share = batch.len().div_ceil(self.shards.len()).max(1);
-        let Self { rit, config, pool, params, target, shards, contrastive, grads, .. } = self;
+        let Self { rit, config, pool, params, target, grads, shards, contrastive, workers, .. } = self;
         let tables = [rit.utility.decoder.tables(params), rit.utility.decoder.tables(target)];
         let networks = [(&params[..], &tables[0]), (&target[..], &tables[1])];
-        let parts = || batch.chunks(share).chain(std::iter::repeat(&[][..]));
-        let work: Vec<_> = shards.iter_mut().zip(parts()).collect();
+        let part =
+            |shard: usize| &batch[(shard * share).min(batch.len())..((shard + 1) * share).min(batch.len())];
         pool.install(|| {
-            work.into_par_iter().for_each(|(shard, episodes)| {
-                shard.forward(rit, networks, config.gamma, episodes, filled);
+            shards.par_iter_mut().enumerate().for_each(|(index, shard)| {
+                let episodes = part(index);
+                workers.with(|worker| shard.forward(rit, networks, config, episodes, filled, worker));
             });
-        });
-        let contrastive_loss = pool.install(|| contrastive.loss(rit, params, shards, pairing));
-        pool.install(|| {
-            shards.par_iter_mut().for_each(|shard| shard.backward(rit, params, &tables[0]));
+            if let Some(discriminator) = &rit.discriminator {
+                let dim = rit.config.representation_dim();
+                contrastive.loss(discriminator, dim, params, shards, workers, pairing);
+            }
+            shards.par_iter_mut().for_each(|shard| {
+                workers.with(|worker| shard.backward(rit, params, &tables[0], &mut worker.scratch));
+            });
         });
 
         grads.fill(0.0);
-        let mut losses = Losses { contrastive_loss, ..Losses::default() };
-        let parts = contrastive.parts.iter().map(|(_, grads, _)| grads);
-        for part in shards.iter().map(|shard| &shard.grads).chain(parts) {
-            rit_nn::math::vectorized(|| rit_nn::math::add_scaled(grads, 1.0, part));
-        }
+        let mut losses = Losses::default();
         for shard in shards.iter() {
+            add(grads, &shard.grads);
             losses.td_loss += shard.td_loss / filled as f64;
+            losses.contrastive_loss += shard.contrastive_loss;
             losses.q_total_mean += shard.q_total_sum / filled as f64;
             losses.target_mean += shard.target_sum / filled as f64;
         }
@@ -185,11 +215,17 @@ impl Update {
         &self.grads
     }
 
-    /// What the last update's networks said of the batch's episode at a time: for comparison with other
-    /// implementations.
+    /// What the last update's networks said of one of its batch's `episodes` at a time: for comparison with
+    /// other implementations.
     pub fn inspect(&self, episodes: usize, episode: usize, time: usize) -> Inspection<'_> {
         let share = episodes.div_ceil(self.shards.len()).max(1);
         Inspection { rit: &self.rit, shard: &self.shards[episode / share], episode: episode % share, time }
+    }
+}
+
+vectorized! {
+    fn add<'a>(sums: &'a mut [f32], part: &'a [f32]) {
+        math::add_scaled(sums, 1.0, part);
     }
 }
 
@@ -199,32 +235,37 @@ impl Shard {
         &mut self,
         rit: &Rit,
         [(online, online_tables), (target, target_tables)]: [(&[f32], &Tables); 2],
-        gamma: f32,
+        config: &UpdateConfig,
         episodes: &[&Episode],
         filled: usize,
+        Worker { target: target_networks, scratch }: &mut Worker,
     ) {
+        self.grads.clear();
+        self.grads.resize(online.len(), 0.0);
+        (self.td_loss, self.contrastive_loss, self.q_total_sum, self.target_sum) = (0.0, 0.0, 0.0, 0.0);
+        self.d_total.clear();
+        self.td_targets.clear();
         let rows = &mut self.rows;
-        rows.fill_from_episodes(episodes);
-        rit.prepare(online, online_tables, rows, Before::default(), &mut self.online);
+        rows.fill_from_episodes(episodes, config.terminal_states);
+
+        rit.prepare(online, online_tables, rows, Before::default(), &mut self.online, scratch);
         self.greedy.resize(rows.agent_rows(), 0);
         let decoder = &mut self.online.utility.decoder;
         rit.utility.decoder.greedy(online, online_tables, rows, decoder, &mut self.greedy);
         // The greedy pass's utilities make room for those of the actions taken, which backward needs.
         rit.value(online, online_tables, rows, &rows.actions, &mut self.online);
-        rit.prepare(target, target_tables, rows, Before::default(), &mut self.target);
-        rit.value(target, target_tables, rows, &self.greedy, &mut self.target);
+        rit.prepare(target, target_tables, rows, Before::default(), target_networks, scratch);
+        rit.value(target, target_tables, rows, &self.greedy, target_networks);
+        self.target_q_total.clone_from(&target_networks.q_total);
 
-        (self.td_loss, self.q_total_sum, self.target_sum) = (0.0, 0.0, 0.0);
-        self.d_total.clear();
-        self.td_targets.clear();
         for (group, step) in rows.steps.iter().enumerate() {
             if !step.filled {
                 self.d_total.push(0.0);
                 self.td_targets.push(0.0);
                 continue;
             }
-            let next = self.target.q_total[rows.next_group(group)];
-            let td_target = td::target(step.reward, gamma, step.terminated, next);
+            let next = rows.next_group(group).map_or(0.0, |next| self.target_q_total[next]);
+            let td_target = td::target(step.reward, config.gamma, step.terminated, next);
             let q_total = self.online.q_total[group];
             let (loss, d_total) = td::squared_error(td_target, q_total, filled);
             self.td_loss += loss;
@@ -233,33 +274,29 @@ impl Shard {
             self.d_total.push(d_total);
             self.td_targets.push(td_target);
         }
-        // The contrastive loss adds to this before backward does.
         self.d_representation.clear();
         self.d_representation.resize(rows.agent_rows() * rit.config.representation_dim(), 0.0);
     }
 
     /// From the gradients by Q_total and by z to those of all parameters but the discriminator's.
-    fn backward(&mut self, rit: &Rit, params: &[f32], tables: &Tables) {
-        let Self { rows, online, d_total, d_q, d_utilities, d_representation, grads, .. } = self;
-        grads.clear();
-        grads.resize(params.len(), 0.0);
+    fn backward(&mut self, rit: &Rit, params: &[f32], tables: &Tables, scratch: &mut Scratch) {
+        let Self { rows, online, d_total, d_representation, grads, .. } = self;
         if rows.groups.is_empty() {
             return;
         }
-        let z = rit.config.representation_dim();
-        d_q.resize(rows.agent_rows(), 0.0);
+        let (z, n_actions) = (rit.config.representation_dim(), rit.config.n_actions);
+        let mut d_q = scratch.take(rows.agent_rows());
         if let Some(mixer) = &rit.mixer {
             let d_z = dense_mut(d_representation, z);
-            mixer.backward(params, rows, &online.chosen, &mut online.mixer, d_total, d_q, d_z, grads);
+            let (chosen, state) = (&online.chosen, &mut online.mixer);
+            mixer.backward(params, rows, chosen, state, d_total, &mut d_q, d_z, grads, scratch);
         } else {
             for (group, &d_total) in rows.groups.iter().zip(&*d_total) {
                 d_q[group.queries.clone()].fill(d_total);
             }
         }
-        let n_actions = rit.config.n_actions;
-        d_utilities.clear();
-        d_utilities.resize(rows.agent_rows() * n_actions, 0.0);
-        for (row, (&action, &d_q)) in rows.actions.iter().zip(&*d_q).enumerate() {
+        let mut d_utilities = scratch.take_zeros(rows.agent_rows() * n_actions);
+        for (row, (&action, &d_q)) in rows.actions.iter().zip(d_q.iter()).enumerate() {
             d_utilities[row * n_actions + usize::from(action)] = d_q;
         }
         rit.utility.backward(
@@ -268,75 +305,75 @@ impl Shard {
             rows,
             rit.representation(&online.task_encoder),
             &mut online.utility,
-            View::dense(d_utilities, n_actions),
+            View::dense(&d_utilities, n_actions),
             dense_mut(d_representation, z),
             grads,
+            scratch,
         );
+        scratch.give(d_q);
+        scratch.give(d_utilities);
         if let Some(task_encoder) = &rit.task_encoder {
             let d_z = View::dense(d_representation, z);
-            task_encoder.backward(params, rows, &mut online.task_encoder, d_z, grads);
+            task_encoder.backward(params, rows, &mut online.task_encoder, d_z, grads, scratch);
         }
     }
 }
 
 impl Contrastive {
-    /// L_C over all filled agent rows of the batch; adds its gradient by z to the shards'.
+    /// L_C over all filled agent rows of the batch, left in the shards' parts of it together with its gradients
+    /// by the discriminator's parameters and by z, which is of `z` columns.
     fn loss(
         &mut self,
-        rit: &Rit,
+        discriminator: &Discriminator,
+        z: usize,
         params: &[f32],
         shards: &mut [Shard],
+        workers: &Workers,
         pairing: impl FnOnce(usize) -> Vec<usize>,
-    ) -> f64 {
-        let Some(discriminator) = &rit.discriminator else {
-            return 0.0;
-        };
-        let z = rit.config.representation_dim();
-        self.rows.clear();
+    ) {
+        let Self { rows, inverse, pairs, d_pairs, same } = self;
+        rows.clear();
         for (index, shard) in shards.iter().enumerate() {
-            self.rows.extend(shard.rows.filled_agent_rows().map(|(row, step)| (index, row, step.task)));
+            rows.extend(shard.rows.filled_agent_rows().map(|(row, step)| (index, row, step.task)));
         }
-        let rows = &self.rows;
         let count = rows.len();
         let pairing = pairing(count);
-        self.inverse.resize(count, 0);
-        for (i, &partner) in pairing.iter().enumerate() {
-            self.inverse[partner] = i;
-        }
+        inverse.resize(count, 0);
+        pairs.clear();
+        same.clear();
         let representation = |i: usize| {
             let (shard, row, _) = rows[i];
             &shards[shard].online.task_encoder.representation[row * z..][..z]
         };
-        self.pairs.clear();
-        self.same.clear();
         for (i, &partner) in pairing.iter().enumerate() {
-            self.pairs.extend_from_slice(representation(i));
-            self.pairs.extend_from_slice(representation(partner));
-            self.same.push(rows[i].2 == rows[partner].2);
+            inverse[partner] = i;
+            pairs.extend_from_slice(representation(i));
+            pairs.extend_from_slice(representation(partner));
+            same.push(rows[i].2 == rows[partner].2);
         }
+        d_pairs.resize(count * 2 * z, 0.0);
 
-        // Parts as many as shards, in the pairs' order.
-        self.parts.resize_with(shards.len(), Default::default);
+        // Parts as many as shards, in the pairs' order; a part's gradients go into the shard of the same place.
         let share = count.div_ceil(shards.len()).max(1);
-        let pairs = View::dense(&self.pairs, 2 * z);
-        let same = &self.same;
-        self.parts.par_iter_mut().enumerate().for_each(|(part, (state, grads, loss))| {
-            let range = (part * share).min(count)..((part + 1) * share).min(count);
-            grads.clear();
-            grads.resize(params.len(), 0.0);
-            *loss = discriminator.loss(params, pairs.rows(range.clone()), &same[range], count, state, grads);
+        let parts =
+            pairs.chunks(share * 2 * z).zip(d_pairs.chunks_mut(share * 2 * z)).zip(same.chunks(share));
+        let parts: Vec<_> = shards.iter_mut().zip(parts).collect();
+        parts.into_par_iter().for_each(|(shard, ((pairs, d_pairs), same))| {
+            let (from, to) = (View::dense(pairs, 2 * z), ViewMut::dense(d_pairs, 2 * z));
+            let grads = &mut shard.grads;
+            let sum = workers
+                .with(|worker| discriminator.loss(params, from, same, count, to, grads, &mut worker.scratch));
+            shard.contrastive_loss = sum / count as f64;
         });
 
-        let d_pair = |i: usize| &self.parts[i / share].0.d_pairs[i % share * 2 * z..][..2 * z];
         for (i, &(shard, row, _)) in rows.iter().enumerate() {
             // Row i is the first of its own pair and the second of another.
-            let (first, second) = (&d_pair(i)[..z], &d_pair(self.inverse[i])[z..]);
+            let (first, second) = (&d_pairs[i * 2 * z..][..z], &d_pairs[inverse[i] * 2 * z + z..][..z]);
             let d_z = &mut shards[shard].d_representation[row * z..][..z];
             for ((d_z, first), second) in d_z.iter_mut().zip(first).zip(second) {
                 *d_z += first + second;
             }
         }
-        self.parts.iter().map(|(_, _, loss)| loss).sum::<f64>() / count as f64
     }
 }
 
@@ -387,7 +424,7 @@ impl<'a> Inspection<'a> {
 
     /// The target network's Q_total of the greedy joint action.
     pub fn target_q_total(&self) -> f32 {
-        self.shard.target.q_total[self.group()]
+        self.shard.target_q_total[self.group()]
     }
 
     /// The TD target.

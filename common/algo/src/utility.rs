@@ -6,7 +6,8 @@ use crate::{
     encoder::{Encoder, EncoderState},
     rit::RitConfig,
 };
-use rit_nn::{Gru, LayoutBuilder, View, ViewMut, attention::Visible, fit, gru::GruState, matmul};
+use faer::Accum;
+use rit_nn::{Gru, LayoutBuilder, Scratch, View, ViewMut, attention::Visible, fit, gru::GruState, matmul};
 
 /// The utility function network.
 #[derive(Clone, Debug)]
@@ -24,8 +25,6 @@ pub struct UtilityState {
     gru: GruState,
     /// The decoder's part, with the utilities.
     pub decoder: DecoderState,
-    d_history: Vec<f32>,
-    d_encoded: Vec<f32>,
 }
 
 impl Utility {
@@ -50,13 +49,14 @@ impl Utility {
         before: Option<View<'_>>,
         representation: View<'_>,
         state: &mut UtilityState,
+        scratch: &mut Scratch,
     ) {
         let h = self.gru.hidden_dim;
         self.encoder.forward(params, rows, Visible::Where(&rows.others), &mut state.encoder);
         let encoded = View::dense(&state.encoder.encoded, self.encoder.width());
         let gates = fit(&mut state.gru.gates, rows.agent_rows() * 3 * h);
-        self.gru.input.forward(params, encoded, ViewMut::dense(gates, 3 * h));
-        self.gru.forward(params, &rows.agent_times, before, &mut state.gru);
+        matmul::x_wt(encoded, self.gru.input.weight(params), ViewMut::dense(gates, 3 * h), Accum::Replace);
+        self.gru.forward(params, &rows.agent_times, before, &mut state.gru, scratch);
         let history = View::dense(&state.gru.history, h);
         self.decoder.prepare(params, tables, history, representation, &mut state.decoder);
     }
@@ -73,29 +73,35 @@ impl Utility {
         d_utilities: View<'_>,
         d_representation: ViewMut<'_>,
         grads: &mut [f32],
+        scratch: &mut Scratch,
     ) {
         let (h, width) = (self.gru.hidden_dim, self.encoder.width());
         let history = View::dense(&state.gru.history, h);
-        let d_history = fit(&mut state.d_history, rows.agent_rows() * h);
+        let mut d_history = scratch.take(rows.agent_rows() * h);
         self.decoder.backward(
             params,
             tables,
             history,
             representation,
-            &mut state.decoder,
+            &state.decoder,
             d_utilities,
-            ViewMut::dense(d_history, h),
+            ViewMut::dense(&mut d_history, h),
             d_representation,
             grads,
+            scratch,
         );
-        self.gru.backward(params, &rows.agent_times, &mut state.gru, d_history, grads);
+        self.gru.backward(params, &rows.agent_times, &mut state.gru, &mut d_history, grads, scratch);
+        scratch.give(d_history);
         let d_gates = View::dense(&state.gru.gates, 3 * h);
         let encoded = View::dense(&state.encoder.encoded, width);
-        matmul::dyt_x(d_gates, encoded, self.gru.input.weight_mut(grads));
-        let d_encoded = ViewMut::dense(fit(&mut state.d_encoded, rows.agent_rows() * width), width);
-        matmul::dy_w(d_gates, self.gru.input.weight(params), d_encoded, faer::Accum::Replace);
-        let d_encoded = View::dense(&state.d_encoded, width);
-        self.encoder.backward(params, rows, &mut state.encoder, d_encoded, grads);
+        matmul::dyt_x(d_gates, encoded, self.gru.input.weight_mut(grads), Accum::Add);
+        let mut d_encoded = scratch.take(rows.agent_rows() * width);
+        let to = ViewMut::dense(&mut d_encoded, width);
+        matmul::dy_w(d_gates, self.gru.input.weight(params), to, Accum::Replace);
+        let d_encoded_view = View::dense(&d_encoded, width);
+        let (d_agents, d_attended) = self.encoder.split(d_encoded_view);
+        self.encoder.backward(params, rows, &mut state.encoder, d_attended, Some(d_agents), grads, scratch);
+        scratch.give(d_encoded);
     }
 }
 

@@ -1,9 +1,11 @@
 //! The whole model on small random batches: numeric gradients of every parameter, acting against training,
 //! and independence of threads and of company.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "helpers of tests are tests too")]
 
 use rand::RngExt as _;
 use rit_algo::{
-    Acting, Mixing, Rit, RitConfig, TaskRepresentations, Update, UpdateConfig, contrastive::draw_pairing,
+    Acting, Mixing, Rit, RitConfig, TaskRepresentations, TerminalStates, Update, UpdateConfig,
+    contrastive::draw_pairing,
 };
 use rit_episode::{End, Episode, Observation, Policy, Rng, RunSeed, Stream, Turn, decision_order};
 use rit_nn::{OptimizerKind, gradcheck};
@@ -67,7 +69,16 @@ fn batch(seed: u64) -> Vec<Episode> {
 
 fn update(rit: &Arc<Rit>, shards: usize, threads: usize, params: Vec<f32>) -> Update {
     let optimizer = OptimizerKind::Adam { beta1: 0.9, beta2: 0.999, eps: 1e-8 };
-    let config = UpdateConfig { gamma: 0.9, lr: 1e-2, optimizer, grad_norm_clip: 10.0, shards, threads };
+    let terminal_states = TerminalStates::LeftOut;
+    let config = UpdateConfig {
+        gamma: 0.9,
+        lr: 1e-2,
+        optimizer,
+        grad_norm_clip: 10.0,
+        shards,
+        threads,
+        terminal_states,
+    };
     Update::new(Arc::clone(rit), config, params).unwrap()
 }
 

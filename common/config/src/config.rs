@@ -1,6 +1,6 @@
 //! The resolved configuration: complete, and within its limits. `presets/all.toml` says what each key means.
 
-use rit_algo::{Mixing, RitConfig, TaskRepresentations, UpdateConfig};
+use rit_algo::{Mixing, RitConfig, TaskRepresentations, TerminalStates, UpdateConfig};
 use rit_env::{EnvironmentOptions, TaskSet};
 use rit_episode::RunSeed;
 use rit_nn::OptimizerKind;
@@ -208,6 +208,7 @@ impl Config {
             grad_norm_clip: algorithm.grad_norm_clip,
             shards: self.learner.shards,
             threads: self.learner.threads,
+            terminal_states: TerminalStates::LeftOut,
         }
     }
 

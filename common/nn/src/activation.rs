@@ -1,28 +1,28 @@
 //! Activations over whole buffers, each with its backward.
 
-use crate::{View, ViewMut, math};
+use crate::{View, ViewMut, math, vectorized};
 
-/// y = max(y, 0), in place.
-pub fn relu(mut y: ViewMut<'_>) {
-    math::vectorized(|| {
+vectorized! {
+    /// y = max(y, 0), in place.
+    pub fn relu<'a>(y: ViewMut<'a>) {
         for row in 0..y.rows {
             for value in y.row(row) {
                 *value = value.max(0.0);
             }
         }
-    });
+    }
 }
 
-/// dy = dy where y > 0, else 0, in place; `y` is what [`relu`] left.
-pub fn relu_backward(y: View<'_>, mut dy: ViewMut<'_>) {
-    debug_assert_eq!((y.rows, y.cols), (dy.rows, dy.cols));
-    math::vectorized(|| {
+vectorized! {
+    /// dy = dy where y > 0, else 0, in place; `y` is what [`relu`] left.
+    pub fn relu_backward<'a>(y: View<'a>, dy: ViewMut<'a>) {
+        debug_assert_eq!((y.rows, y.cols), (dy.rows, dy.cols));
         for row in 0..y.rows {
             for (dy, y) in dy.row(row).iter_mut().zip(y.row(row)) {
                 *dy = if *y > 0.0 { *dy } else { 0.0 };
             }
         }
-    });
+    }
 }
 
 /// ELU(x) = x where x > 0, else e^x − 1.

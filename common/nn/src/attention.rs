@@ -3,7 +3,10 @@
 //! Groups are ragged: each has its own numbers of queries and keys, and only keys that exist. A query that
 //! sees nothing gets zeros, exactly, and passes no gradient.
 
-use crate::{LayoutBuilder, Linear, View, ViewMut, fit, math};
+use crate::{
+    LayoutBuilder, Linear, Scratch, View, ViewMut, activation, fit, linear, math, matmul, vectorized,
+};
+use faer::Accum;
 use std::ops::Range;
 
 /// Query, key and value layers, h → a, with bias; the value goes through ReLU; heads split a evenly;
@@ -50,10 +53,10 @@ pub enum Visible<'a> {
 pub struct AttentionState {
     /// `[Q, a]`; backward leaves its gradient here.
     queries: Vec<f32>,
-    /// Keys and ReLU'd values, `[K, 2a]`; backward leaves their gradient here.
+    /// Keys and ReLU'd values, `[K, 2a]`.
     key_values: Vec<f32>,
-    d_key_values: Vec<f32>,
-    /// Softmax weights; the groups' `[queries, heads, keys]` one after another.
+    /// Softmax weights; the groups' `[heads, queries, keys]` one after another. Backward leaves the scores'
+    /// gradient here.
     weights: Vec<f32>,
 }
 
@@ -66,51 +69,48 @@ impl Attention {
         Self { query, key_value, heads, dim }
     }
 
-    /// Writes `out` (Q, a) from `x_queries` (Q, h) and `x_keys` (K, h).
-    #[allow(clippy::too_many_arguments, reason = "a matrix and its companions, each named")]
-    pub fn forward(
+    /// Queries, keys (without their bias) and values of all rows. `x_queries` (Q, h), `x_keys` (K, h).
+    pub fn project(&self, params: &[f32], x_queries: View<'_>, x_keys: View<'_>, state: &mut AttentionState) {
+        let a = self.dim;
+        let queries = ViewMut::dense(fit(&mut state.queries, x_queries.rows * a), a);
+        self.query.forward(params, x_queries, queries);
+        let mut key_values = ViewMut::dense(fit(&mut state.key_values, x_keys.rows * 2 * a), 2 * a);
+        matmul::x_wt(x_keys, self.key_value.weight(params), key_values.reborrow(), Accum::Replace);
+        // The key's bias adds the same to all scores of a query, which softmax does not see: it is left out, and
+        // its gradient is zero.
+        linear::add_row_relu(key_values.columns(a..2 * a), &self.key_value.bias(params)[a..]);
+    }
+
+    /// Writes `out` (Q, a) from what [`Attention::project`] left.
+    pub fn attend(
         &self,
-        params: &[f32],
-        x_queries: View<'_>,
-        x_keys: View<'_>,
         groups: &[Group],
         visible: Visible<'_>,
         state: &mut AttentionState,
         mut out: ViewMut<'_>,
     ) {
-        let (a, head_dim) = (self.dim, self.dim / self.heads);
-        let scale = 1.0 / (head_dim as f32).sqrt();
-        let queries = ViewMut::dense(fit(&mut state.queries, x_queries.rows * a), a);
-        self.query.forward(params, x_queries, queries);
-        let mut key_values = ViewMut::dense(fit(&mut state.key_values, x_keys.rows * 2 * a), 2 * a);
-        self.key_value.forward(params, x_keys, key_values.reborrow());
-        crate::activation::relu(key_values.columns(a..2 * a));
-
+        let AttentionState { queries, key_values, weights } = state;
         let pairs: usize = groups.iter().map(Group::pairs).sum();
-        let mut weights = fit(&mut state.weights, pairs * self.heads);
-        let mut visible = visible;
-        let (queries, key_values) = (&state.queries, &state.key_values);
-        math::vectorized(|| {
-            for group in groups {
-                let keys = group.keys.len();
-                let key_values = &key_values[group.keys.start * 2 * a..group.keys.end * 2 * a];
-                for query in group.queries.clone() {
-                    let seen = visible.take(keys);
-                    let out = out.row(query);
-                    for head in 0..self.heads {
-                        let columns = head * head_dim..(head + 1) * head_dim;
-                        let weights = take(&mut weights, keys);
-                        let out = &mut out[columns.clone()];
-                        let q = &queries[query * a..][columns];
-                        attend(q, key_values, head * head_dim, a, seen, scale, weights, out);
-                    }
-                }
+        let weights = fit(weights, pairs * self.heads);
+        let head_dim = self.head_dim();
+        soften(View::dense(queries, self.dim), key_values, groups, visible, weights, self.scale(), head_dim);
+        let mut weights = &*weights;
+        for group in groups {
+            for head in 0..self.heads {
+                let (_, values) = self.head_of(key_values, group, head);
+                let (front, rest) = weights.split_at(group.pairs());
+                let weights_of = View::dense(front, group.keys.len());
+                let columns = head * head_dim..(head + 1) * head_dim;
+                let to = out.reborrow().rows(group.queries.clone()).columns(columns);
+                matmul::dy_w(weights_of, values, to, Accum::Replace);
+                weights = rest;
             }
-        });
+        }
     }
 
     /// Takes `d_out` (Q, a). Writes `dx_queries` (Q, h) and `dx_keys` (K, h) and adds to the parameters'
-    /// gradients.
+    /// gradients. With w the weights: d_value = wᵀ d_out, d_w = d_out valueᵀ, d_score = w (d_w − Σ w d_w),
+    /// d_query = d_score key and d_key = d_scoreᵀ query.
     #[allow(clippy::too_many_arguments, reason = "a matrix and its companions, each named")]
     pub fn backward(
         &self,
@@ -123,122 +123,158 @@ impl Attention {
         dx_queries: ViewMut<'_>,
         dx_keys: ViewMut<'_>,
         grads: &mut [f32],
+        scratch: &mut Scratch,
     ) {
-        let (a, head_dim) = (self.dim, self.dim / self.heads);
-        let scale = 1.0 / (head_dim as f32).sqrt();
-        let (queries, key_values) = (&mut state.queries, &state.key_values);
-        let d_key_values = fit(&mut state.d_key_values, key_values.len());
-        d_key_values.fill(0.0);
-        let mut weights = &mut state.weights[..];
-        math::vectorized(|| {
-            for group in groups {
-                let keys = group.keys.len();
-                let rows = group.keys.start * 2 * a..group.keys.end * 2 * a;
-                let (key_values, d_key_values) = (&key_values[rows.clone()], &mut d_key_values[rows]);
-                for query in group.queries.clone() {
-                    for head in 0..self.heads {
-                        let columns = head * head_dim..(head + 1) * head_dim;
-                        let weights = take(&mut weights, keys);
-                        let q = &mut queries[query * a..][columns.clone()];
-                        let d_out = &d_out.row(query)[columns];
-                        attend_backward(
-                            q,
-                            key_values,
-                            d_key_values,
-                            head * head_dim,
-                            a,
-                            scale,
-                            weights,
-                            d_out,
-                        );
+        let (a, head_dim) = (self.dim, self.head_dim());
+        let AttentionState { queries, key_values, weights } = state;
+        // Every key belongs to one group, so all of this is written.
+        let mut d_key_values = scratch.take(key_values.len());
+        let both = |head: usize| {
+            (head * head_dim..(head + 1) * head_dim, a + head * head_dim..a + (head + 1) * head_dim)
+        };
+        let mut rest = &weights[..];
+        for group in groups {
+            for head in 0..self.heads {
+                let (front, behind) = rest.split_at(group.pairs());
+                let (columns, values) = both(head);
+                let d_out = d_out.rows(group.queries.clone()).columns(columns);
+                let d_values =
+                    ViewMut::dense(&mut d_key_values, 2 * a).rows(group.keys.clone()).columns(values);
+                matmul::dyt_x(View::dense(front, group.keys.len()), d_out, d_values, Accum::Replace);
+                rest = behind;
+            }
+        }
+        soften_backward(
+            d_out,
+            View::dense(key_values, 2 * a).columns(a..2 * a),
+            groups,
+            weights,
+            self.scale(),
+            head_dim,
+        );
+        let mut d_queries = scratch.take(queries.len());
+        let mut rest = &weights[..];
+        for group in groups {
+            for head in 0..self.heads {
+                let (front, behind) = rest.split_at(group.pairs());
+                let d_scores = View::dense(front, group.keys.len());
+                let (columns, _) = both(head);
+                let (keys, _) = self.head_of(key_values, group, head);
+                let of_queries = group.queries.clone();
+                let d_q = ViewMut::dense(&mut d_queries, a).rows(of_queries.clone()).columns(columns.clone());
+                matmul::dy_w(d_scores, keys, d_q, Accum::Replace);
+                let q = View::dense(queries, a).rows(of_queries).columns(columns.clone());
+                let d_keys =
+                    ViewMut::dense(&mut d_key_values, 2 * a).rows(group.keys.clone()).columns(columns);
+                matmul::dyt_x(d_scores, q, d_keys, Accum::Replace);
+                rest = behind;
+            }
+        }
+        let values = View::dense(key_values, 2 * a).columns(a..2 * a);
+        activation::relu_backward(values, ViewMut::dense(&mut d_key_values, 2 * a).columns(a..2 * a));
+        self.query.backward(params, x_queries, View::dense(&d_queries, a), Some(dx_queries), grads);
+        let d_key_values_view = View::dense(&d_key_values, 2 * a);
+        linear::add_column_sums(
+            d_key_values_view.columns(a..2 * a),
+            &mut self.key_value.bias_mut(grads)[a..],
+        );
+        matmul::dyt_x(d_key_values_view, x_keys, self.key_value.weight_mut(grads), Accum::Add);
+        matmul::dy_w(d_key_values_view, self.key_value.weight(params), dx_keys, Accum::Replace);
+        scratch.give(d_key_values);
+        scratch.give(d_queries);
+    }
+
+    /// One head's keys and values of one group, (keys, head dim) each.
+    fn head_of<'a>(&self, key_values: &'a [f32], group: &Group, head: usize) -> (View<'a>, View<'a>) {
+        let (a, head_dim) = (self.dim, self.head_dim());
+        let rows = View::dense(key_values, 2 * a).rows(group.keys.clone());
+        let first = head * head_dim;
+        (rows.columns(first..first + head_dim), rows.columns(a + first..a + first + head_dim))
+    }
+
+    /// Size of one head.
+    fn head_dim(&self) -> usize {
+        self.dim / self.heads
+    }
+
+    /// 1/√(a / heads).
+    fn scale(&self) -> f32 {
+        1.0 / (self.head_dim() as f32).sqrt()
+    }
+}
+
+vectorized! {
+    /// Scores and softmax of every query, group by group and head by head; exactly zero where unseen.
+    fn soften<'a>(
+        queries: View<'a>,
+        key_values: &'a [f32],
+        groups: &'a [Group],
+        visible: Visible<'a>,
+        weights: &'a mut [f32],
+        scale: f32,
+        head_dim: usize,
+    ) {
+        let a = queries.cols;
+        for group in groups {
+            let (keys, pairs) = (group.keys.len(), group.pairs());
+            let key_values = &key_values[group.keys.start * 2 * a..group.keys.end * 2 * a];
+            let seen = visible.take(pairs);
+            for head in (0..a).step_by(head_dim) {
+                let weights = take(&mut weights, pairs);
+                for (at, weights) in weights.chunks_exact_mut(keys).enumerate() {
+                    let q = &queries.row(group.queries.start + at)[head..head + head_dim];
+                    let sees = |key: usize| seen.is_none_or(|seen| seen[at * keys + key] != 0);
+                    let mut largest = f32::NEG_INFINITY;
+                    for (key, (weight, key_value)) in weights.iter_mut().zip(key_values.chunks_exact(2 * a)).enumerate() {
+                        *weight = scale * math::dot(q, &key_value[head..head + head_dim]);
+                        if sees(key) {
+                            largest = largest.max(*weight);
+                        }
+                    }
+                    let mut total = 0.0;
+                    for (key, weight) in weights.iter_mut().enumerate() {
+                        // An unseen key weighs exactly nothing.
+                        *weight = if sees(key) { math::exp(*weight - largest) } else { 0.0 };
+                        total += *weight;
+                    }
+                    // Who sees nothing keeps the zeros.
+                    if total > 0.0 {
+                        weights.iter_mut().for_each(|weight| *weight /= total);
                     }
                 }
             }
-        });
-        let values = View::dense(key_values, 2 * a).columns(a..2 * a);
-        crate::activation::relu_backward(values, ViewMut::dense(d_key_values, 2 * a).columns(a..2 * a));
-        let (d_queries, d_key_values) = (View::dense(queries, a), View::dense(d_key_values, 2 * a));
-        self.query.backward(params, x_queries, d_queries, Some(dx_queries), grads);
-        self.key_value.backward(params, x_keys, d_key_values, Some(dx_keys), grads);
-    }
-}
-
-/// One head of one query. `key_values` (keys, 2a); the head's keys begin at column `first`, its values at
-/// `a + first`. Leaves the softmax in `weights` (keys), zero where unseen.
-#[allow(clippy::too_many_arguments, reason = "a row and its companions, each named")]
-#[inline(always)]
-fn attend(
-    q: &[f32],
-    key_values: &[f32],
-    first: usize,
-    a: usize,
-    seen: Option<&[u8]>,
-    scale: f32,
-    weights: &mut [f32],
-    out: &mut [f32],
-) {
-    let sees = |key: usize| seen.is_none_or(|seen| seen[key] != 0);
-    let mut largest = f32::NEG_INFINITY;
-    for key in 0..weights.len() {
-        if sees(key) {
-            weights[key] = scale * math::dot(q, &key_values[key * 2 * a + first..][..q.len()]);
-            largest = largest.max(weights[key]);
-        }
-    }
-    out.fill(0.0);
-    let mut total = 0.0;
-    for (key, weight) in weights.iter_mut().enumerate() {
-        // An unseen key weighs exactly nothing; a query that sees none keeps its zeros.
-        *weight = if sees(key) { math::exp(*weight - largest) } else { 0.0 };
-        total += *weight;
-    }
-    if total == 0.0 {
-        return;
-    }
-    for (key, weight) in weights.iter_mut().enumerate() {
-        *weight /= total;
-        if *weight != 0.0 {
-            math::add_scaled(out, *weight, &key_values[key * 2 * a + a + first..][..q.len()]);
         }
     }
 }
 
-/// One head of one query backward: d_value = w d_out, d_score = w (d_w − Σ w d_w), d_key = d_score q,
-/// d_query = Σ d_score key, which replaces the query.
-#[allow(clippy::too_many_arguments, reason = "a row and its companions, each named")]
-#[inline(always)]
-fn attend_backward(
-    q: &mut [f32],
-    key_values: &[f32],
-    d_key_values: &mut [f32],
-    first: usize,
-    a: usize,
-    scale: f32,
-    weights: &mut [f32],
-    d_out: &[f32],
-) {
-    let mut mean = 0.0;
-    let value = |key: usize| key * 2 * a + a + first..key * 2 * a + a + first + d_out.len();
-    for (key, &weight) in weights.iter().enumerate() {
-        if weight != 0.0 {
-            mean += weight * math::dot(d_out, &key_values[value(key)]);
+vectorized! {
+    /// Turns weights into the gradient by the scores, before their scaling.
+    fn soften_backward<'a>(
+        d_out: View<'a>,
+        values: View<'a>,
+        groups: &'a [Group],
+        weights: &'a mut [f32],
+        scale: f32,
+        head_dim: usize,
+    ) {
+        let mut d_weights: Vec<f32> = Vec::new();
+        for group in groups {
+            for head in (0..values.cols).step_by(head_dim) {
+                let weights = take(&mut weights, group.pairs());
+                for (query, weights) in group.queries.clone().zip(weights.chunks_exact_mut(group.keys.len())) {
+                    let d_out = &d_out.row(query)[head..head + head_dim];
+                    d_weights.resize(weights.len(), 0.0);
+                    let mut mean = 0.0;
+                    for (key, (weight, d_weight)) in group.keys.clone().zip(weights.iter().zip(&mut d_weights)) {
+                        *d_weight = math::dot(d_out, &values.row(key)[head..head + head_dim]);
+                        mean += weight * *d_weight;
+                    }
+                    for (weight, d_weight) in weights.iter_mut().zip(&d_weights) {
+                        *weight *= (d_weight - mean) * scale;
+                    }
+                }
+            }
         }
-    }
-    // The scores' gradient needs the weight once more, so it is made in a second pass that ends with the
-    // query: d_query may only replace it when no key needs it any more.
-    for (key, weight) in weights.iter_mut().enumerate() {
-        if *weight == 0.0 {
-            continue;
-        }
-        let d_weight = math::dot(d_out, &key_values[value(key)]);
-        math::add_scaled(&mut d_key_values[value(key)], *weight, d_out);
-        let d_score = *weight * (d_weight - mean) * scale;
-        math::add_scaled(&mut d_key_values[key * 2 * a + first..][..q.len()], d_score, q);
-        *weight = d_score;
-    }
-    q.fill(0.0);
-    for (key, &d_score) in weights.iter().enumerate() {
-        math::add_scaled(q, d_score, &key_values[key * 2 * a + first..][..q.len()]);
     }
 }
 
@@ -251,13 +287,13 @@ fn take<'a>(rest: &mut &'a mut [f32], len: usize) -> &'a mut [f32] {
 }
 
 impl<'a> Visible<'a> {
-    /// The next query's row; `None` where it sees all.
+    /// The next group's flags, `[queries, keys]`; `None` where all is seen.
     #[inline(always)]
-    fn take(&mut self, keys: usize) -> Option<&'a [u8]> {
+    fn take(&mut self, pairs: usize) -> Option<&'a [u8]> {
         match self {
             Self::All => None,
             Self::Where(flags) => {
-                let (front, back) = flags.split_at(keys);
+                let (front, back) = flags.split_at(pairs);
                 *flags = back;
                 Some(front)
             }
@@ -294,7 +330,8 @@ mod tests {
     ) -> (Vec<f32>, AttentionState) {
         let (mut out, mut state) = (vec![9.0; 3 * DIM], AttentionState::default());
         let (xq, xk) = (View::dense(xq, INPUTS), View::dense(xk, INPUTS));
-        attention.forward(params, xq, xk, &groups(), visible, &mut state, ViewMut::dense(&mut out, DIM));
+        attention.project(params, xq, xk, &mut state);
+        attention.attend(&groups(), visible, &mut state, ViewMut::dense(&mut out, DIM));
         (out, state)
     }
 
@@ -356,7 +393,18 @@ mod tests {
         let d_out = noise(4, 3 * DIM);
         let views = (View::dense(&xq, INPUTS), View::dense(&xk, INPUTS), View::dense(&d_out, DIM));
         let (to_q, to_k) = (ViewMut::dense(&mut dxq, INPUTS), ViewMut::dense(&mut dxk, INPUTS));
-        attention.backward(&params, views.0, views.1, &groups(), &mut state, views.2, to_q, to_k, &mut grads);
+        attention.backward(
+            &params,
+            views.0,
+            views.1,
+            &groups(),
+            &mut state,
+            views.2,
+            to_q,
+            to_k,
+            &mut grads,
+            &mut Scratch::default(),
+        );
         assert_eq!(dxq[2 * INPUTS..], [0.0; INPUTS]);
         assert_eq!(dxk[3 * INPUTS..], [0.0; 2 * INPUTS]);
     }
@@ -375,6 +423,7 @@ mod tests {
             let (mut dxq, mut dxk, mut grads) = (vec![0.0; xq.len()], vec![0.0; xk.len()], vec![0.0; len]);
             let views = (View::dense(&xq, INPUTS), View::dense(&xk, INPUTS), View::dense(&to, DIM));
             let (to_q, to_k) = (ViewMut::dense(&mut dxq, INPUTS), ViewMut::dense(&mut dxk, INPUTS));
+            let scratch = &mut Scratch::default();
             attention.backward(
                 &params,
                 views.0,
@@ -385,6 +434,7 @@ mod tests {
                 to_q,
                 to_k,
                 &mut grads,
+                scratch,
             );
             check("params", &params, &grads, |params| loss(params, &xq, &xk));
             check("queries", &xq, &dxq, |xq| loss(&params, xq, &xk));

@@ -3,7 +3,11 @@
 //! Rows are time-major. A row's predecessor is the row of the same place at the time before, so the rows of a
 //! time are a prefix of those before: sequences are ordered longest first.
 
-use crate::{LayoutBuilder, Linear, View, ViewMut, linear, math, matmul};
+use crate::{
+    LayoutBuilder, Linear, Scratch, View, ViewMut, fit, linear,
+    math::{LANES, Lanes, each, load, sigmoid, store, tanh},
+    matmul, vectorized,
+};
 use faer::Accum;
 
 /// The unit: gates in the order reset r, update u, new n;
@@ -21,10 +25,10 @@ pub struct Gru {
 /// What forward leaves for backward. With R rows over all times:
 #[derive(Debug, Default)]
 pub struct GruState {
-    /// In: the input's share of the gates. Out: r, u, n. `[R, 3h]`.
+    /// In: the input's share of the gates, Wᵢ x without its bias. Out: r, u, n. `[R, 3h]`.
     pub gates: Vec<f32>,
-    /// The hidden state's share of the gates, `[R, 3h]`.
-    from_hidden: Vec<f32>,
+    /// Wₕₙ h + bₕₙ, `[R, h]`.
+    new_from_hidden: Vec<f32>,
     /// The hidden state after each row, `[R, h]`.
     pub history: Vec<f32>,
 }
@@ -43,37 +47,48 @@ impl Gru {
         Self { input, hidden, hidden_dim }
     }
 
-    /// Runs over all times. `state.gates` holds the input's share already (see [`Gru::input`]); `times[t]` is
-    /// the first row of time t, its last element R. The state before the first time is `before`
-    /// (rows of time 0, h), or zeros.
-    pub fn forward(&self, params: &[f32], times: &[usize], before: Option<View<'_>>, state: &mut GruState) {
+    /// Runs over all times. `state.gates` holds the input's share already: [`Gru::input`]'s weight, without its
+    /// bias. `times[t]` is the first row of time t, its last element R. The state before the first time is
+    /// `before` (rows of time 0, h), or zeros.
+    pub fn forward(
+        &self,
+        params: &[f32],
+        times: &[usize],
+        before: Option<View<'_>>,
+        state: &mut GruState,
+        scratch: &mut Scratch,
+    ) {
         let h = self.hidden_dim;
         let rows = times.last().copied().unwrap_or(0);
         debug_assert_eq!(state.gates.len(), rows * 3 * h);
-        crate::fit(&mut state.from_hidden, rows * 3 * h);
-        crate::fit(&mut state.history, rows * h);
-        linear::fill_rows(ViewMut::dense(&mut state.from_hidden, 3 * h), self.hidden.bias(params));
+        fit(&mut state.new_from_hidden, rows * h);
+        fit(&mut state.history, rows * h);
+        let mut from_hidden = scratch.take(times.get(1).map_or(0, |&rows| rows * 3 * h));
         for (time, range) in times.windows(2).map(|pair| pair[0]..pair[1]).enumerate() {
             let (done, ahead) = state.history.split_at_mut(range.start * h);
-            let previous = if time == 0 {
-                before
-            } else {
-                Some(View::dense(&done[times[time - 1] * h..], h).rows(0..range.len()))
+            let previous = match before {
+                Some(before) if time == 0 => before,
+                None if time == 0 => View::dense(&[], h),
+                _ => View::dense(&done[times[time - 1] * h..], h).rows(0..range.len()),
             };
-            let from_hidden = &mut state.from_hidden[range.start * 3 * h..range.end * 3 * h];
-            if let Some(previous) = previous {
+            let from_hidden = &mut from_hidden[..range.len() * 3 * h];
+            if previous.rows > 0 {
                 let to = ViewMut::dense(from_hidden, 3 * h);
-                matmul::x_wt(previous, self.hidden.weight(params), to, Accum::Add);
+                matmul::x_wt(previous, self.hidden.weight(params), to, Accum::Replace);
+            } else {
+                from_hidden.fill(0.0);
             }
-            let gates = &mut state.gates[range.start * 3 * h..range.end * 3 * h];
-            math::vectorized(|| {
-                for row in 0..range.len() {
-                    let previous = previous.map_or(&[][..], |previous| previous.row(row));
-                    let at = row * 3 * h..(row + 1) * 3 * h;
-                    step(&mut gates[at.clone()], &from_hidden[at], previous, &mut ahead[row * h..][..h]);
-                }
-            });
+            step(
+                &mut state.gates[range.start * 3 * h..range.end * 3 * h],
+                from_hidden,
+                [self.input.bias(params), self.hidden.bias(params)],
+                previous,
+                &mut state.new_from_hidden[range.start * h..range.end * h],
+                &mut ahead[..range.len() * h],
+                h,
+            );
         }
+        scratch.give(from_hidden);
     }
 
     /// Takes `d_history` (R, h), the loss's gradient by each row's hidden state where it is used outside the
@@ -89,95 +104,131 @@ impl Gru {
         state: &mut GruState,
         d_history: &mut [f32],
         grads: &mut [f32],
+        scratch: &mut Scratch,
     ) {
         let h = self.hidden_dim;
-        let history = &state.history;
+        let mut d_from_hidden = scratch.take(times.get(1).map_or(0, |&rows| rows * 3 * h));
         for time in (0..times.len() - 1).rev() {
             let range = times[time]..times[time + 1];
             let before = if time == 0 { range.start } else { times[time - 1] };
             let (d_done, d_ahead) = d_history.split_at_mut(range.start * h);
             let d_previous = &mut d_done[before * h..];
-            let previous = &history[before * h..];
-            let gates = &mut state.gates[range.start * 3 * h..range.end * 3 * h];
-            let from_hidden = &mut state.from_hidden[range.start * 3 * h..range.end * 3 * h];
-            math::vectorized(|| {
-                for row in 0..range.len() {
-                    let at = row * 3 * h..(row + 1) * 3 * h;
-                    let (previous, d_previous) = if time == 0 {
-                        (&[][..], &mut [][..])
-                    } else {
-                        (&previous[row * h..][..h], &mut d_previous[row * h..][..h])
-                    };
-                    let d_next = &d_ahead[row * h..][..h];
-                    let (gates, from_hidden) = (&mut gates[at.clone()], &mut from_hidden[at]);
-                    step_backward(gates, from_hidden, previous, d_next, d_previous);
-                }
-            });
+            let previous = if time == 0 { &[] } else { &state.history[before * h..][..range.len() * h] };
+            let d_from_hidden = &mut d_from_hidden[..range.len() * 3 * h];
+            step_backward(
+                &mut state.gates[range.start * 3 * h..range.end * 3 * h],
+                &state.new_from_hidden[range.start * h..range.end * h],
+                previous,
+                &d_ahead[..range.len() * h],
+                d_from_hidden,
+                d_previous,
+                h,
+            );
+            let d_from_hidden = View::dense(d_from_hidden, 3 * h);
+            linear::add_column_sums(d_from_hidden, self.hidden.bias_mut(grads));
             if time > 0 {
-                let d_from_hidden = View::dense(from_hidden, 3 * h);
                 let d_previous = ViewMut::dense(d_previous, h).rows(0..range.len());
                 matmul::dy_w(d_from_hidden, self.hidden.weight(params), d_previous, Accum::Add);
-                let previous = View::dense(&previous[..range.len() * h], h);
-                matmul::dyt_x(d_from_hidden, previous, self.hidden.weight_mut(grads));
+                matmul::dyt_x(
+                    d_from_hidden,
+                    View::dense(previous, h),
+                    self.hidden.weight_mut(grads),
+                    Accum::Add,
+                );
             }
         }
-        let rows = |gates| View::dense(gates, 3 * h);
-        linear::add_column_sums(rows(&state.from_hidden), self.hidden.bias_mut(grads));
-        linear::add_column_sums(rows(&state.gates), self.input.bias_mut(grads));
+        scratch.give(d_from_hidden);
+        linear::add_column_sums(View::dense(&state.gates, 3 * h), self.input.bias_mut(grads));
     }
 }
 
-/// One row forward. `gates` holds the input's share and is left with r, u, n; `previous` is empty for zeros.
-#[inline(always)]
-fn step(gates: &mut [f32], from_hidden: &[f32], previous: &[f32], next: &mut [f32]) {
-    let h = next.len();
-    let (r, rest) = gates.split_at_mut(h);
-    let (u, n) = rest.split_at_mut(h);
-    let (hr, rest) = from_hidden.split_at(h);
-    let (hu, hn) = rest.split_at(h);
-    for i in 0..h {
-        r[i] = math::sigmoid(r[i] + hr[i]);
-        u[i] = math::sigmoid(u[i] + hu[i]);
-        n[i] = math::tanh(n[i] + r[i] * hn[i]);
-        next[i] = n[i] - u[i] * n[i];
-    }
-    for (next, (u, previous)) in next.iter_mut().zip(u.iter().zip(previous)) {
-        *next += u * previous;
+vectorized! {
+    /// The rows of one time. `gates` [rows, 3h] holds the input's share and is left with r, u, n; `biases` are
+    /// the input's and the hidden state's; `previous` has no rows where it is zeros.
+    fn step<'a>(
+        gates: &'a mut [f32],
+        from_hidden: &'a [f32],
+        biases: [&'a [f32]; 2],
+        previous: View<'a>,
+        new_from_hidden: &'a mut [f32],
+        next: &'a mut [f32],
+        h: usize,
+    ) {
+        let [input, hidden] = biases;
+        for row in 0..next.len() / h {
+            let gates = &mut gates[row * 3 * h..][..3 * h];
+            let from_hidden = &from_hidden[row * 3 * h..][..3 * h];
+            for at in (0..h).step_by(LANES) {
+                let len = LANES.min(h - at);
+                let r = gate_sum(gates, from_hidden, input, hidden, at, len);
+                let u = gate_sum(gates, from_hidden, input, hidden, h + at, len);
+                let (r, u) = (each(|lane| sigmoid(r[lane])), each(|lane| sigmoid(u[lane])));
+                let (x, f) = (load(gates, 2 * h + at, len), load(from_hidden, 2 * h + at, len));
+                let (i, b) = (load(input, 2 * h + at, len), load(hidden, 2 * h + at, len));
+                let hn = each(|lane| f[lane] + b[lane]);
+                let n = each(|lane| tanh(r[lane].mul_add(hn[lane], x[lane] + i[lane])));
+                let previous = if previous.rows == 0 { [0.0; LANES] } else { load(previous.row(row), at, len) };
+                let new = each(|lane| u[lane].mul_add(previous[lane] - n[lane], n[lane]));
+                store(r, gates, at, len);
+                store(u, gates, h + at, len);
+                store(n, gates, 2 * h + at, len);
+                store(hn, new_from_hidden, row * h + at, len);
+                store(new, next, row * h + at, len);
+            }
+        }
     }
 }
 
-/// One row backward. `gates` holds r, u, n and is left with the gradient by the input's share; `from_hidden`
-/// likewise by the hidden state's share; u ⊙ d_next is added to `d_previous`.
+vectorized! {
+    /// The rows of one time backward. `gates` holds r, u, n and is left with the gradient by the input's share;
+    /// `d_from_hidden` gets that by the hidden state's; u ⊙ d_next is added to `d_previous`. `previous` is
+    /// empty where it is zeros.
+    fn step_backward<'a>(
+        gates: &'a mut [f32],
+        new_from_hidden: &'a [f32],
+        previous: &'a [f32],
+        d_next: &'a [f32],
+        d_from_hidden: &'a mut [f32],
+        d_previous: &'a mut [f32],
+        h: usize,
+    ) {
+        for row in 0..d_next.len() / h {
+            let gates = &mut gates[row * 3 * h..][..3 * h];
+            let d_from_hidden = &mut d_from_hidden[row * 3 * h..][..3 * h];
+            for at in (0..h).step_by(LANES) {
+                let len = LANES.min(h - at);
+                let (r, u) = (load(gates, at, len), load(gates, h + at, len));
+                let n = load(gates, 2 * h + at, len);
+                let hn = load(new_from_hidden, row * h + at, len);
+                let d = load(d_next, row * h + at, len);
+                let mut before = [0.0; LANES];
+                if !previous.is_empty() {
+                    before = load(previous, row * h + at, len);
+                    let d_before = load(d_previous, row * h + at, len);
+                    let d_before = each(|lane| d[lane].mul_add(u[lane], d_before[lane]));
+                    store(d_before, d_previous, row * h + at, len);
+                }
+                let du = each(|lane| (before[lane] - n[lane]) * d[lane] * u[lane] * (1.0 - u[lane]));
+                let dn = each(|lane| d[lane] * (1.0 - u[lane]) * (1.0 - n[lane] * n[lane]));
+                let dr = each(|lane| dn[lane] * hn[lane] * r[lane] * (1.0 - r[lane]));
+                let d_hn = each(|lane| dn[lane] * r[lane]);
+                store(dr, gates, at, len);
+                store(du, gates, h + at, len);
+                store(dn, gates, 2 * h + at, len);
+                store(dr, d_from_hidden, at, len);
+                store(du, d_from_hidden, h + at, len);
+                store(d_hn, d_from_hidden, 2 * h + at, len);
+            }
+        }
+    }
+}
+
+/// A gate before its activation: both shares and both biases.
 #[inline(always)]
-fn step_backward(
-    gates: &mut [f32],
-    from_hidden: &mut [f32],
-    previous: &[f32],
-    d_next: &[f32],
-    d_previous: &mut [f32],
-) {
-    let h = d_next.len();
-    let (r, rest) = gates.split_at_mut(h);
-    let (u, n) = rest.split_at_mut(h);
-    let (hr, rest) = from_hidden.split_at_mut(h);
-    let (hu, hn) = rest.split_at_mut(h);
-    for (d_previous, (d_next, u)) in d_previous.iter_mut().zip(d_next.iter().zip(u.iter())) {
-        *d_previous += d_next * u;
-    }
-    // du first needs h − n; without a previous state h is 0.
-    for i in 0..h {
-        hu[i] = -n[i];
-    }
-    for (hu, previous) in hu.iter_mut().zip(previous) {
-        *hu += previous;
-    }
-    for i in 0..h {
-        let du = d_next[i] * hu[i] * u[i] * (1.0 - u[i]);
-        let dn = d_next[i] * (1.0 - u[i]) * (1.0 - n[i] * n[i]);
-        let dr = dn * hn[i] * r[i] * (1.0 - r[i]);
-        (hr[i], hu[i], hn[i]) = (dr, du, dn * r[i]);
-        (r[i], u[i], n[i]) = (dr, du, dn);
-    }
+fn gate_sum(x: &[f32], from_hidden: &[f32], input: &[f32], hidden: &[f32], at: usize, len: usize) -> Lanes {
+    let (x, f) = (load(x, at, len), load(from_hidden, at, len));
+    let (i, b) = (load(input, at, len), load(hidden, at, len));
+    each(|lane| x[lane] + f[lane] + (i[lane] + b[lane]))
 }
 
 #[cfg(test)]
@@ -198,9 +249,10 @@ mod tests {
 
     fn run(gru: &Gru, params: &[f32], x: &[f32], times: &[usize], before: Option<View<'_>>) -> GruState {
         let mut state = GruState::default();
-        let gates = crate::fit(&mut state.gates, x.len() / INPUTS * 3 * H);
-        gru.input.forward(params, View::dense(x, INPUTS), ViewMut::dense(gates, 3 * H));
-        gru.forward(params, times, before, &mut state);
+        let gates = fit(&mut state.gates, x.len() / INPUTS * 3 * H);
+        let to = ViewMut::dense(gates, 3 * H);
+        matmul::x_wt(View::dense(x, INPUTS), gru.input.weight(params), to, Accum::Replace);
+        gru.forward(params, times, before, &mut state, &mut Scratch::default());
         state
     }
 
@@ -267,9 +319,9 @@ mod tests {
         };
         let mut state = run(&gru, &params, &x, &TIMES, None);
         let (mut grads, mut dx, mut d_history) = (vec![0.0; len], vec![0.0; x.len()], to.clone());
-        gru.backward(&params, &TIMES, &mut state, &mut d_history, &mut grads);
+        gru.backward(&params, &TIMES, &mut state, &mut d_history, &mut grads, &mut Scratch::default());
         let d_gates = View::dense(&state.gates, 3 * H);
-        matmul::dyt_x(d_gates, View::dense(&x, INPUTS), gru.input.weight_mut(&mut grads));
+        matmul::dyt_x(d_gates, View::dense(&x, INPUTS), gru.input.weight_mut(&mut grads), Accum::Add);
         matmul::dy_w(d_gates, gru.input.weight(&params), ViewMut::dense(&mut dx, INPUTS), Accum::Replace);
         check("params", &params, &grads, |params| loss(params, &x));
         check("x", &x, &dx, |x| loss(&params, x));

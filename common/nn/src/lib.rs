@@ -16,6 +16,7 @@ pub mod linear;
 pub mod math;
 pub mod matmul;
 pub mod optimizer;
+mod scratch;
 mod view;
 
 pub use attention::Attention;
@@ -23,4 +24,5 @@ pub use gru::Gru;
 pub use layout::{Layout, LayoutBuilder, Param};
 pub use linear::Linear;
 pub use optimizer::{Optimizer, OptimizerKind};
+pub use scratch::{Buffer, Scratch};
 pub use view::{View, ViewMut, fit};

@@ -1,6 +1,6 @@
 //! A linear layer, y = x Wᵀ + b.
 
-use crate::{LayoutBuilder, View, ViewMut, activation, math, matmul};
+use crate::{LayoutBuilder, View, ViewMut, math, matmul, vectorized};
 use faer::Accum;
 use std::ops::Range;
 
@@ -66,14 +66,14 @@ impl Linear {
 
     /// y = x Wᵀ + b. `x` (rows, inputs), `y` (rows, outputs).
     pub fn forward(&self, params: &[f32], x: View<'_>, mut y: ViewMut<'_>) {
-        fill_rows(y.reborrow(), self.bias(params));
-        matmul::x_wt(x, self.weight(params), y, Accum::Add);
+        matmul::x_wt(x, self.weight(params), y.reborrow(), Accum::Replace);
+        add_row(y, self.bias(params));
     }
 
     /// y = ReLU(x Wᵀ + b). `x` (rows, inputs), `y` (rows, outputs).
     pub fn forward_relu(&self, params: &[f32], x: View<'_>, mut y: ViewMut<'_>) {
-        self.forward(params, x, y.reborrow());
-        activation::relu(y);
+        matmul::x_wt(x, self.weight(params), y.reborrow(), Accum::Replace);
+        add_row_relu(y, self.bias(params));
     }
 
     /// Adds to the gradients of W and b; writes dx (rows, inputs) where asked for. `dy` (rows, outputs).
@@ -93,31 +93,58 @@ impl Linear {
 
     /// Adds to the gradients of W and b alone.
     pub fn backward_params(&self, x: View<'_>, dy: View<'_>, grads: &mut [f32]) {
-        matmul::dyt_x(dy, x, self.weight_mut(grads));
+        matmul::dyt_x(dy, x, self.weight_mut(grads), Accum::Add);
         add_column_sums(dy, self.bias_mut(grads));
     }
 }
 
-/// Writes the same row everywhere.
-pub fn fill_rows(mut y: ViewMut<'_>, row: &[f32]) {
-    for at in 0..y.rows {
-        y.row(at).copy_from_slice(row);
+vectorized! {
+    /// y += the same row everywhere.
+    pub fn add_row<'a>(y: ViewMut<'a>, row: &'a [f32]) {
+        for at in 0..y.rows {
+            for (y, x) in y.row(at).iter_mut().zip(row) {
+                *y += x;
+            }
+        }
     }
 }
 
-/// sums += Σ rows of dy: the gradient of a bias.
-pub fn add_column_sums(dy: View<'_>, sums: &mut [f32]) {
-    math::vectorized(|| {
+vectorized! {
+    /// y += x.
+    pub fn add<'a>(y: ViewMut<'a>, x: View<'a>) {
+        for row in 0..y.rows {
+            math::add_scaled(y.row(row), 1.0, x.row(row));
+        }
+    }
+}
+
+vectorized! {
+    /// y = ReLU(y + the same row everywhere).
+    pub fn add_row_relu<'a>(y: ViewMut<'a>, row: &'a [f32]) {
+        for at in 0..y.rows {
+            for (y, x) in y.row(at).iter_mut().zip(row) {
+                *y = (*y + x).max(0.0);
+            }
+        }
+    }
+}
+
+vectorized! {
+    /// sums += Σ rows of dy: the gradient of a bias.
+    pub fn add_column_sums<'a>(dy: View<'a>, sums: &'a mut [f32]) {
         for row in 0..dy.rows {
             math::add_scaled(sums, 1.0, dy.row(row));
         }
-    });
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gradcheck::{check, noise};
+    use crate::{
+        activation,
+        gradcheck::{check, noise},
+    };
 
     #[test]
     fn side_by_side_layers_are_the_layers() {

@@ -1,39 +1,87 @@
 //! Element-wise functions that the compiler can vectorise, and the dispatch that lets it.
 //!
-//! The stock build targets any x86-64; [`vectorized`] compiles what it is given for the instruction sets
-//! that faer's `pulp` knows and picks one at run time. Nothing here uses a fused multiply-add, so every
-//! instruction set gives the same bits.
+//! The stock build targets any x86-64. [`vectorized!`](crate::vectorized) declares functions that are compiled
+//! once for each instruction set that faer's `pulp` knows, the best of which is picked at run time. Every one gives
+//! the same bits: what rounds once here (`mul_add`) rounds once everywhere, if slowly where the processor cannot.
 
 use std::sync::LazyLock;
 
 static ARCH: LazyLock<pulp::Arch> = LazyLock::new(pulp::Arch::new);
 
-/// Runs element-wise work compiled for the best instruction set of this machine. Functions called inside
-/// must be `#[inline(always)]`, or they are compiled for the base instruction set.
-#[inline(always)]
-pub fn vectorized<R>(work: impl FnOnce() -> R) -> R {
-    ARCH.dispatch(work)
+/// Declares a function whose body is compiled for every instruction set.
+///
+/// A closure would not do: it is compiled for the base instruction set unless the compiler happens to inline
+/// it. What the body calls must be `#[inline(always)]` for the same reason.
+#[macro_export]
+macro_rules! vectorized {
+    (
+        $(#[$attribute:meta])*
+        $visibility:vis fn $name:ident $(<$($lifetime:lifetime),+>)? (
+            $($argument:ident: $kind:ty),+ $(,)?
+        ) $(-> $output:ty)? $body:block
+    ) => {
+        $(#[$attribute])*
+        $visibility fn $name $(<$($lifetime),+>)? ($($argument: $kind),+) $(-> $output)? {
+            struct Body $(<$($lifetime),+>)? { $($argument: $kind),+ }
+            impl $(<$($lifetime),+>)? $crate::math::Kernel for Body $(<$($lifetime),+>)? {
+                #[allow(unused_parens, reason = "a type or none")]
+                type Output = ($($output)?);
+
+                #[inline(always)]
+                #[allow(unused_mut, reason = "arguments are taken as the body wants them")]
+                fn run(self) -> Self::Output {
+                    let Self { $(mut $argument),+ } = self;
+                    $body
+                }
+            }
+            $crate::math::dispatch(Body { $($argument),+ })
+        }
+    };
+}
+
+/// What [`vectorized!`](crate::vectorized) makes of a function.
+pub trait Kernel {
+    /// What it returns.
+    type Output;
+
+    /// Does it; `#[inline(always)]`.
+    fn run(self) -> Self::Output;
+}
+
+/// Runs a kernel as compiled for the best instruction set of this machine.
+#[inline]
+pub fn dispatch<K: Kernel>(kernel: K) -> K::Output {
+    struct Op<K>(K);
+
+    impl<K: Kernel> pulp::WithSimd for Op<K> {
+        type Output = K::Output;
+
+        #[inline(always)]
+        fn with_simd<S: pulp::Simd>(self, _: S) -> K::Output {
+            self.0.run()
+        }
+    }
+
+    ARCH.dispatch(Op(kernel))
 }
 
 /// Adding and subtracting 1.5 · 2²³ rounds to an integer, which then stands in the low bits.
 const ROUND: f32 = 12_582_912.0;
 
-/// e^x within 2 ulp for x in [−87, 88]; saturates outside.
+/// e^x with a relative error below 3e-7 for x in [−87, 88]; saturates outside.
 #[inline(always)]
 pub fn exp(x: f32) -> f32 {
     // x = n ln 2 + r with |r| <= ln 2 / 2; e^x = 2^n e^r, e^r by its Taylor polynomial.
     let x = x.clamp(-87.0, 88.0);
-    let shifted = x * std::f32::consts::LOG2_E + ROUND;
+    let shifted = x.mul_add(std::f32::consts::LOG2_E, ROUND);
     let n = shifted - ROUND;
     // ln 2 in two parts, the first exact in few bits, so that r keeps its precision.
-    let r = (x - n * 0.693_359_4) - n * -2.121_944_4e-4;
-    let p = 1.0 / 5040.0;
-    let p = p * r + 1.0 / 720.0;
-    let p = p * r + 1.0 / 120.0;
-    let p = p * r + 1.0 / 24.0;
-    let p = p * r + 1.0 / 6.0;
-    let p = p * r + 0.5;
-    let p = p * r * r + r + 1.0;
+    let r = n.mul_add(2.121_944_4e-4, n.mul_add(-0.693_359_4, x));
+    // Two short chains instead of a long one: the functions built on this wait for it.
+    let (low, high) = (r.mul_add(1.0 / 6.0, 0.5), r.mul_add(1.0 / 120.0, 1.0 / 24.0));
+    let rr = r * r;
+    let p = rr.mul_add(1.0 / 720.0, high);
+    let p = rr.mul_add(rr.mul_add(p, low), r) + 1.0;
     // n lies in [-126, 127], so the exponent stays in range.
     let exponent = (shifted.to_bits() as i32).wrapping_sub(ROUND.to_bits() as i32);
     p * f32::from_bits(((exponent + 127) << 23) as u32)
@@ -51,8 +99,51 @@ pub fn tanh(x: f32) -> f32 {
     1.0 - 2.0 / (exp(2.0 * x) + 1.0)
 }
 
-/// Lanes of a sum: wide enough for AVX-512, the same everywhere, so that sums are too.
-const LANES: usize = 16;
+/// Numbers worked on together: wide enough for AVX-512, the same everywhere, so that sums are too.
+pub const LANES: usize = 16;
+
+/// Up to [`LANES`] numbers of a row, the rest zero. Work on these, unlike work on slices of one buffer, leaves
+/// the compiler nothing to suspect of overlapping.
+pub type Lanes = [f32; LANES];
+
+/// The `len` numbers that begin at `at`.
+#[inline(always)]
+pub fn load(from: &[f32], at: usize, len: usize) -> Lanes {
+    if len == LANES {
+        if let Some(lanes) = from[at..].first_chunk() {
+            return *lanes;
+        }
+    }
+    let mut lanes = [0.0; LANES];
+    for (lane, x) in lanes.iter_mut().zip(&from[at..at + len]) {
+        *lane = *x;
+    }
+    lanes
+}
+
+/// Writes `len` numbers to where `at` is.
+#[inline(always)]
+pub fn store(lanes: Lanes, to: &mut [f32], at: usize, len: usize) {
+    if len == LANES {
+        if let Some(to) = to[at..].first_chunk_mut() {
+            *to = lanes;
+            return;
+        }
+    }
+    for (x, lane) in to[at..at + len].iter_mut().zip(lanes) {
+        *x = lane;
+    }
+}
+
+/// A function of each lane's number.
+#[inline(always)]
+pub fn each(f: impl Fn(usize) -> f32) -> Lanes {
+    let mut lanes = [0.0; LANES];
+    for (lane, x) in lanes.iter_mut().enumerate() {
+        *x = f(lane);
+    }
+    lanes
+}
 
 /// Σ aᵢ bᵢ, summed in sixteen lanes.
 #[inline(always)]
@@ -62,11 +153,11 @@ pub fn dot(a: &[f32], b: &[f32]) -> f32 {
     let mut sums = [0.0; LANES];
     for (a, b) in a_lanes.iter().zip(b_lanes) {
         for lane in 0..LANES {
-            sums[lane] += a[lane] * b[lane];
+            sums[lane] = a[lane].mul_add(b[lane], sums[lane]);
         }
     }
     for (lane, (a, b)) in a_rest.iter().zip(b_rest).enumerate() {
-        sums[lane] += a * b;
+        sums[lane] = a.mul_add(*b, sums[lane]);
     }
     let mut width = LANES / 2;
     while width > 0 {
@@ -82,7 +173,7 @@ pub fn dot(a: &[f32], b: &[f32]) -> f32 {
 #[inline(always)]
 pub fn add_scaled(y: &mut [f32], scale: f32, x: &[f32]) {
     for (y, x) in y.iter_mut().zip(x) {
-        *y += scale * x;
+        *y = scale.mul_add(*x, *y);
     }
 }
 
@@ -110,9 +201,27 @@ mod tests {
     fn dispatch_changes_no_bit() {
         let xs: Vec<f32> = (0..1000).map(|i| (i as f32 - 500.0) * 0.037).collect();
         let plain: Vec<f32> = xs.iter().map(|&x| exp(x) + tanh(x)).collect();
-        let fast = vectorized(|| xs.iter().map(|&x| exp(x) + tanh(x)).collect::<Vec<f32>>());
-        assert_eq!(plain, fast);
-        assert_eq!(dot(&xs, &plain), vectorized(|| dot(&xs, &plain)));
+        vectorized! {
+            fn both<'a>(xs: &'a [f32], plain: &'a [f32]) -> (Vec<f32>, f32) {
+                (xs.iter().map(|&x| exp(x) + tanh(x)).collect(), dot(xs, plain))
+            }
+        }
+        assert_eq!(both(&xs, &plain), (plain.clone(), dot(&xs, &plain)));
+    }
+
+    #[test]
+    fn lanes_come_and_go_whole_or_in_part() {
+        let from: Vec<f32> = (0..40).map(|i| i as f32).collect();
+        for (at, len) in [(0, LANES), (24, LANES), (3, 5), (38, 2)] {
+            let lanes = load(&from, at, len);
+            assert_eq!(lanes[..len], from[at..at + len]);
+            assert!(lanes[len..].iter().all(|&lane| lane == 0.0));
+            let mut to = vec![-1.0; 40];
+            store(each(|lane| 2.0 * lanes[lane]), &mut to, at, len);
+            for (i, &x) in to.iter().enumerate() {
+                assert_eq!(x, if (at..at + len).contains(&i) { 2.0 * i as f32 } else { -1.0 });
+            }
+        }
     }
 
     #[test]

@@ -7,6 +7,20 @@
 
 use crate::{View, ViewMut};
 use faer::{Accum, Par, linalg::matmul::matmul, mat};
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// Multiplications and additions of all products so far, in this process.
+static FLOPS: AtomicU64 = AtomicU64::new(0);
+
+/// How many multiplications and additions all products of this process have taken: what benchmarks divide by
+/// time.
+pub fn flops() -> u64 {
+    FLOPS.load(Ordering::Relaxed)
+}
+
+fn count(m: usize, k: usize, n: usize) {
+    FLOPS.fetch_add(2 * (m * k * n) as u64, Ordering::Relaxed);
+}
 
 /// `y = x wᵀ`, or `y += x wᵀ`: a layer's forward. `x` (rows, in), `w` (out, in), `y` (rows, out).
 pub fn x_wt(x: View<'_>, w: View<'_>, y: ViewMut<'_>, accum: Accum) {
@@ -14,19 +28,23 @@ pub fn x_wt(x: View<'_>, w: View<'_>, y: ViewMut<'_>, accum: Accum) {
     if x.rows == 1 {
         return single_row(x, w, y, accum);
     }
+    count(x.rows, x.cols, w.rows);
     matmul(write(y), accum, read(x), read(w).transpose(), 1.0_f32, Par::Seq);
 }
 
 /// `dx = dy w`, or `dx += dy w`: a layer's backward to its input. `dy` (rows, out), `dx` (rows, in).
 pub fn dy_w(dy: View<'_>, w: View<'_>, dx: ViewMut<'_>, accum: Accum) {
     debug_assert_eq!((dy.cols, dy.rows, dx.cols), (w.rows, dx.rows, w.cols));
+    count(dy.rows, dy.cols, w.cols);
     matmul(write(dx), accum, read(dy), read(w), 1.0_f32, Par::Seq);
 }
 
-/// `dw += dyᵀ x`: a layer's backward to its weight. `dy` (rows, out), `x` (rows, in), `dw` (out, in).
-pub fn dyt_x(dy: View<'_>, x: View<'_>, dw: ViewMut<'_>) {
+/// `dw = dyᵀ x`, or `dw += dyᵀ x`: a layer's backward to its weight. `dy` (rows, out), `x` (rows, in), `dw`
+/// (out, in).
+pub fn dyt_x(dy: View<'_>, x: View<'_>, dw: ViewMut<'_>, accum: Accum) {
     debug_assert_eq!((dy.rows, dy.cols, x.cols), (x.rows, dw.rows, dw.cols));
-    matmul(write(dw), Accum::Add, read(dy).transpose(), read(x), 1.0_f32, Par::Seq);
+    count(dy.cols, dy.rows, x.cols);
+    matmul(write(dw), accum, read(dy).transpose(), read(x), 1.0_f32, Par::Seq);
 }
 
 /// One row goes through faer's matrix–vector path, which sums in another order. A second row of zeros keeps
@@ -84,7 +102,7 @@ mod tests {
         let view = |data, cols| View::dense(data, cols);
         x_wt(view(&x, inputs), view(&w, inputs), ViewMut::dense(&mut y, outputs), Accum::Replace);
         dy_w(view(&dy, outputs), view(&w, inputs), ViewMut::dense(&mut dx, inputs), Accum::Add);
-        dyt_x(view(&dy, outputs), view(&x, inputs), ViewMut::dense(&mut dw, inputs));
+        dyt_x(view(&dy, outputs), view(&x, inputs), ViewMut::dense(&mut dw, inputs), Accum::Add);
         let close = |a: f32, b: f32| assert!((a - b).abs() < 1e-5, "{a} {b}");
         for row in 0..rows {
             for out in 0..outputs {

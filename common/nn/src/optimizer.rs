@@ -1,6 +1,6 @@
 //! RMSprop and Adam as PyTorch defines them, and clipping by the global norm.
 
-use crate::math;
+use crate::vectorized;
 
 /// Which optimiser, with its own constants.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -51,48 +51,70 @@ impl Optimizer {
     /// Takes one step along `scale · grads`.
     pub fn step(&mut self, params: &mut [f32], grads: &[f32], scale: f32) {
         self.steps += 1;
-        let lr = self.lr;
         match self.kind {
-            OptimizerKind::RmsProp { alpha, eps } => math::vectorized(|| {
-                for ((p, g), v) in params.iter_mut().zip(grads).zip(&mut self.mean_square) {
-                    let g = g * scale;
-                    *v = alpha * *v + (1.0 - alpha) * g * g;
-                    *p -= lr * g / (v.sqrt() + eps);
-                }
-            }),
+            OptimizerKind::RmsProp { alpha, eps } => {
+                rmsprop(params, grads, &mut self.mean_square, [scale, self.lr, alpha, eps]);
+            }
             OptimizerKind::Adam { beta1, beta2, eps } => {
                 // The corrections are taken in f64, as PyTorch takes them.
                 let correction = |beta: f32| 1.0 - f64::from(beta).powf(self.steps as f64);
-                let rate = (f64::from(lr) / correction(beta1)) as f32;
+                let rate = (f64::from(self.lr) / correction(beta1)) as f32;
                 let root = correction(beta2).sqrt() as f32;
-                let moments = self.mean.iter_mut().zip(&mut self.mean_square);
-                math::vectorized(|| {
-                    for ((p, g), (m, v)) in params.iter_mut().zip(grads).zip(moments) {
-                        let g = g * scale;
-                        *m = beta1 * *m + (1.0 - beta1) * g;
-                        *v = beta2 * *v + (1.0 - beta2) * g * g;
-                        *p -= rate * *m / (v.sqrt() / root + eps);
-                    }
-                });
+                let moments = (&mut self.mean[..], &mut self.mean_square[..]);
+                adam(params, grads, moments, [scale, beta1, beta2, rate, root, eps]);
             }
         }
     }
 }
 
-/// The Euclidean norm of all gradients, summed in f64.
-pub fn norm(grads: &[f32]) -> f64 {
-    // Lanes of a fixed number keep the sum the same on every instruction set.
-    let (chunks, rest) = grads.as_chunks::<8>();
-    let mut sums = [0.0_f64; 8];
-    math::vectorized(|| {
+vectorized! {
+    fn rmsprop<'a>(
+        params: &'a mut [f32],
+        grads: &'a [f32],
+        mean_square: &'a mut [f32],
+        constants: [f32; 4],
+    ) {
+        let [scale, lr, alpha, eps] = constants;
+        for ((p, g), v) in params.iter_mut().zip(grads).zip(mean_square) {
+            let g = g * scale;
+            *v = alpha * *v + (1.0 - alpha) * g * g;
+            *p -= lr * g / (v.sqrt() + eps);
+        }
+    }
+}
+
+vectorized! {
+    fn adam<'a>(
+        params: &'a mut [f32],
+        grads: &'a [f32],
+        moments: (&'a mut [f32], &'a mut [f32]),
+        constants: [f32; 6],
+    ) {
+        let [scale, beta1, beta2, rate, root, eps] = constants;
+        let moments = moments.0.iter_mut().zip(moments.1);
+        for ((p, g), (m, v)) in params.iter_mut().zip(grads).zip(moments) {
+            let g = g * scale;
+            *m = beta1 * *m + (1.0 - beta1) * g;
+            *v = beta2 * *v + (1.0 - beta2) * g * g;
+            *p -= rate * *m / (v.sqrt() / root + eps);
+        }
+    }
+}
+
+vectorized! {
+    /// The Euclidean norm of all gradients, summed in f64: in lanes of a fixed number, so that the sum is the
+    /// same on every instruction set.
+    pub fn norm<'a>(grads: &'a [f32]) -> f64 {
+        let (chunks, rest) = grads.as_chunks::<8>();
+        let mut sums = [0.0_f64; 8];
         for chunk in chunks {
             for (sum, &g) in sums.iter_mut().zip(chunk) {
                 *sum += f64::from(g) * f64::from(g);
             }
         }
-    });
-    let rest: f64 = rest.iter().map(|&g| f64::from(g) * f64::from(g)).sum();
-    (sums.iter().sum::<f64>() + rest).sqrt()
+        let rest: f64 = rest.iter().map(|&g| f64::from(g) * f64::from(g)).sum();
+        (sums.iter().sum::<f64>() + rest).sqrt()
+    }
 }
 
 /// What to scale gradients with so that their norm is at most `limit`: PyTorch's min(1, limit / (‖g‖ + 1e-6)).

@@ -1,0 +1,89 @@
+//! One learner update, as training makes it.
+
+use super::{Report, cpu_s, random_episodes, thread_cpu_s};
+use crate::failure::Failure;
+use faer::Accum;
+use rit_algo::{Rit, Update};
+use rit_config::Config;
+use rit_episode::Stream;
+use rit_learner::replay::Replay;
+use rit_nn::{View, ViewMut, matmul};
+use std::{
+    fs,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+/// Side of the large product that stands for this core's limit.
+const LARGE: usize = 2048;
+
+pub(super) fn run(config: &Config, duration: Duration) -> Result<Report, Failure> {
+    let rit = Arc::new(Rit::new(config.rit()).map_err(Failure::input)?);
+    let params = rit.layout.initial(&mut config.seed.stream(Stream::Weights, 0));
+    let mut update = Update::new(Arc::clone(&rit), config.update(), params).map_err(Failure::runtime)?;
+    let mut replay = Replay::new(config.algorithm.buffer_size);
+    let mut episode_bytes = 0;
+    for episode in random_episodes(config, config.algorithm.buffer_size as u64) {
+        episode_bytes += episode.bytes();
+        replay.insert(episode);
+    }
+
+    let mut number = 0;
+    let mut one_update = |update: &mut Update| {
+        let batch =
+            replay.sample(config.algorithm.batch_size, &mut config.seed.stream(Stream::Replay, number));
+        update.step(&batch, &mut config.seed.stream(Stream::Pairing, number));
+        number += 1;
+    };
+    for _ in 0..3 {
+        one_update(&mut update);
+    }
+    let limit_before = large_product_flops();
+    let (cpu, wall, flops) = (cpu_s(), Instant::now(), matmul::flops());
+    let mut updates = 0;
+    while wall.elapsed() < duration || updates < 3 {
+        one_update(&mut update);
+        updates += 1;
+    }
+    let (cpu, wall, flops) = (cpu_s() - cpu, wall.elapsed().as_secs_f64(), matmul::flops() - flops);
+    // A shared machine's speed drifts: the limit is measured before and after.
+    let limit = f64::midpoint(limit_before, large_product_flops());
+
+    let count = f64::from(updates);
+    let mut report = Report::new();
+    report.insert("update_cpu_ms".into(), (1e3 * cpu / count).into());
+    report.insert("update_wall_ms".into(), (1e3 * wall / count).into());
+    report.insert("update_gflop".into(), (flops as f64 / count * 1e-9).into());
+    report.insert("gemm_gflop_per_cpu_s".into(), (flops as f64 / cpu * 1e-9).into());
+    report.insert("limit_gflop_per_cpu_s".into(), (limit * 1e-9).into());
+    report.insert("gemm_share".into(), (flops as f64 / cpu / limit).into());
+    report.insert("limit".into(), format!("one thread's {LARGE}³ f32 product, before and after").into());
+    report.insert("updates".into(), updates.into());
+    report.insert("parameters".into(), rit.layout.len().into());
+    report.insert("replay_episodes".into(), replay.len().into());
+    report.insert("replay_mb".into(), (episode_bytes as f64 * 1e-6).into());
+    report.insert("peak_rss_mb".into(), peak_rss_mb().into());
+    Ok(report)
+}
+
+/// This core's rate on one large product: multiplications and additions per CPU second.
+fn large_product_flops() -> f64 {
+    let x = vec![0.5; LARGE * LARGE];
+    let mut y = vec![0.0; LARGE * LARGE];
+    let mut best = f64::INFINITY;
+    for _ in 0..4 {
+        let begun = thread_cpu_s();
+        let (x, y) = (View::dense(&x, LARGE), ViewMut::dense(&mut y, LARGE));
+        matmul::x_wt(x, x, y, Accum::Replace);
+        best = best.min(thread_cpu_s() - begun);
+    }
+    2.0 * (LARGE as f64).powi(3) / best
+}
+
+/// The process's largest resident memory, in megabytes; 0 where the system does not say.
+fn peak_rss_mb() -> f64 {
+    let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+    let kib = line.and_then(|line| line.trim().trim_end_matches(" kB").parse::<f64>().ok());
+    kib.unwrap_or(0.0) * 1024e-6
+}
