@@ -1,6 +1,6 @@
 //! An actor: rolls the episodes it is leased and sends them to the learner, until either wants no more.
 //!
-//! [`run`] speaks gRPC on the runtime: leases come in, weights are watched. [`rollout`] is one thread that acts
+//! [`run`] speaks gRPC on the runtime: leases come in, weights are watched. One thread of its own acts
 //! and sends; it takes other weights only between leases.
 
 mod rollout;

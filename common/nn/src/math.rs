@@ -109,10 +109,10 @@ pub type Lanes = [f32; LANES];
 /// The `len` numbers that begin at `at`.
 #[inline(always)]
 pub fn load(from: &[f32], at: usize, len: usize) -> Lanes {
-    if len == LANES {
-        if let Some(lanes) = from[at..].first_chunk() {
-            return *lanes;
-        }
+    if len == LANES
+        && let Some(lanes) = from[at..].first_chunk()
+    {
+        return *lanes;
     }
     let mut lanes = [0.0; LANES];
     for (lane, x) in lanes.iter_mut().zip(&from[at..at + len]) {
@@ -124,11 +124,11 @@ pub fn load(from: &[f32], at: usize, len: usize) -> Lanes {
 /// Writes `len` numbers to where `at` is.
 #[inline(always)]
 pub fn store(lanes: Lanes, to: &mut [f32], at: usize, len: usize) {
-    if len == LANES {
-        if let Some(to) = to[at..].first_chunk_mut() {
-            *to = lanes;
-            return;
-        }
+    if len == LANES
+        && let Some(to) = to[at..].first_chunk_mut()
+    {
+        *to = lanes;
+        return;
     }
     for (x, lane) in to[at..at + len].iter_mut().zip(lanes) {
         *x = lane;
