@@ -11,22 +11,22 @@ use rit_ipc::{EpisodeSender, OpenError, RunSpaceError};
 use rit_proto::{
     transport::{self, Address, AddressError, ConnectError},
     v1::{
-        ActorMessage, Done, Heartbeat, Hello, Leaving, actor_message, learner_message,
+        ActorMessage, Done, Heartbeat, Hello, LearnerMessage, Lease, Leaving, actor_message, learner_message,
         rollout_client::RolloutClient,
     },
 };
 use std::{
-    fs, io,
+    fmt, fs, io,
     sync::{
         Arc,
         atomic::{AtomicBool, Ordering},
     },
     thread,
-    time::Duration,
+    time::{Duration, Instant},
 };
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::Code;
+use tonic::{Code, Streaming};
 
 /// How long an actor waits for the learner's shared memory.
 const OPEN_TIMEOUT: Duration = Duration::from_secs(5);
@@ -37,11 +37,19 @@ const HEARTBEAT_EVERY: Duration = Duration::from_secs(1);
 /// Messages that may wait on their way to the learner.
 const OUTBOX: usize = 16;
 
+/// How long an actor waits for a learner that has gone to come back.
+const RECONNECT_TIMEOUT: Duration = Duration::from_secs(60);
+
+/// From one look for it to the next.
+const RECONNECT_EVERY: Duration = Duration::from_millis(50);
+
 /// What an actor is told on the command line.
 #[derive(Clone, Debug)]
 pub struct ActorOptions {
     /// Unique among the run's actors.
     pub name: String,
+    /// Whether somebody sees to it that there is a learner, so that one that is away is waited for from the start.
+    pub supervised: bool,
 }
 
 /// Why an actor ended early, or did not begin.
@@ -77,7 +85,7 @@ pub enum ActorError {
     #[error(transparent)]
     Rollout(#[from] RolloutError),
     /// The learner ended without a farewell.
-    #[error("the learner has gone: {0}")]
+    #[error("the learner has gone and does not come back: {0}")]
     LearnerGone(String),
     /// The rollout thread could not be started.
     #[error("cannot start the rollout thread: {0}")]
@@ -87,97 +95,195 @@ pub enum ActorError {
     Panicked,
 }
 
+impl ActorError {
+    /// Whether it may be different when the learner is back.
+    fn may_pass(&self) -> bool {
+        match self {
+            Self::NoAddress { .. }
+            | Self::Address(_)
+            | Self::Connect(_)
+            | Self::SharedMemory(_)
+            | Self::LearnerGone(_)
+            | Self::Rollout(RolloutError::Weights(_) | RolloutError::Send(_)) => true,
+            Self::Refused(_)
+            | Self::Model(_)
+            | Self::RunSpace(_)
+            | Self::Rollout(_)
+            | Self::Thread(_)
+            | Self::Panicked => false,
+        }
+    }
+}
+
 /// Runs an actor until the learner wants no more, or until `shutdown`: then it leaves in peace, which means
-/// that all it has sent has been read.
+/// that all it has sent has been read. A learner that dies is waited for: the next one gets a fresh start.
 ///
 /// # Errors
-/// When it cannot begin, when rolling fails, or when the learner goes without a farewell.
+/// When it cannot begin, when rolling fails, or when the learner goes and does not come back.
 pub async fn run(
     run_dir: RunDir,
     config: Config,
     options: ActorOptions,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), ActorError> {
-    let no_address = |error| ActorError::NoAddress { run_dir: run_dir.root().display().to_string(), error };
-    let address: Address = fs::read_to_string(run_dir.address()).map_err(no_address)?.trim().parse()?;
-    let client = transport::connect(&address, run_dir.token()).await?;
-
-    let (outbox, messages) = mpsc::channel(OUTBOX);
-    let say = |message| ActorMessage { message: Some(message) };
-    let hello = Hello {
-        name: options.name,
-        pid: std::process::id(),
-        layout_version: wire::LAYOUT_VERSION,
-        capacity: config.actors.episodes_at_once as u32,
-    };
-    let gone = |what: &dyn std::fmt::Display| ActorError::LearnerGone(what.to_string());
-    let first = outbox.try_send(say(actor_message::Message::Hello(hello)));
-    first.map_err(|error| gone(&error))?;
-    let joined = RolloutClient::new(client.clone()).join(ReceiverStream::new(messages)).await;
-    let mut from_learner = joined.map_err(|status| refusal(&status))?.into_inner();
-    let welcome = from_learner.message().await.map_err(|status| refusal(&status))?;
-    let Some(learner_message::Message::Welcome(welcome)) = welcome.and_then(|message| message.message) else {
-        return Err(gone(&"it did not say welcome"));
-    };
-
-    let (leases, lease_queue) = mpsc::channel(1);
-    let (done, mut lease_done) = mpsc::channel(1);
-    let stop = Arc::new(AtomicBool::new(false));
+    let rit = Arc::new(Rit::new(config.rit())?);
     let layout = PayloadLayout::new(config.environment.task_set.dims());
-    let roller = Roller {
-        rit: Arc::new(Rit::new(config.rit())?),
-        rollout: Roller::rollout(&config),
-        sender: EpisodeSender::open(&Roller::space(&run_dir)?, layout.len(), OPEN_TIMEOUT)?,
-        layout,
-        run_id: run_dir.run_id(),
-        actor: welcome.actor,
-        weights: Weights::watch(client).await.map_err(RolloutError::Weights)?,
-        stop: Arc::clone(&stop),
-    };
-    let (result, mut rolled) = oneshot::channel();
-    let runtime = tokio::runtime::Handle::current();
-    thread::Builder::new()
-        .name("rollout".into())
-        .spawn(move || {
-            let _ = result.send(roller.run(&runtime, lease_queue, &done));
-        })
-        .map_err(ActorError::Thread)?;
-    tracing::info!(actor = welcome.actor, %address, "joined");
+    let actor = Actor { run_dir, config, options, rit, layout };
+    let (leave, leaving) = watch::channel(false);
+    let life = actor.life(leaving);
+    tokio::pin!(life);
+    tokio::select! {
+        ended = &mut life => ended,
+        () = shutdown => {
+            leave.send_replace(true);
+            life.await
+        }
+    }
+}
 
+struct Actor {
+    run_dir: RunDir,
+    config: Config,
+    options: ActorOptions,
+    rit: Arc<Rit>,
+    layout: PayloadLayout,
+}
+
+impl Actor {
+    /// Session after session, until a farewell or until nobody comes back.
+    async fn life(&self, mut leaving: watch::Receiver<bool>) -> Result<(), ActorError> {
+        let mut gone_since = self.options.supervised.then(Instant::now);
+        loop {
+            let mut joined = false;
+            let Err(error) = self.session(&mut leaving, &mut joined).await else { return Ok(()) };
+            if joined {
+                gone_since = Some(Instant::now());
+            }
+            // Whoever never met a learner and is not promised one says so at once.
+            let Some(since) = gone_since.filter(|_| error.may_pass()) else { return Err(error) };
+            if since.elapsed() >= RECONNECT_TIMEOUT {
+                return Err(error);
+            }
+            if joined {
+                tracing::warn!(%error, "waiting for the learner to come back");
+            }
+            tokio::select! {
+                () = tokio::time::sleep(RECONNECT_EVERY) => {}
+                // A learner that is gone waits for nothing of this actor.
+                _ = leaving.wait_for(|leaving| *leaving) => return Ok(()),
+            }
+        }
+    }
+
+    /// One session with one learner, from Hello to Farewell. Sets `joined` once it is welcome.
+    async fn session(
+        &self,
+        leaving: &mut watch::Receiver<bool>,
+        joined: &mut bool,
+    ) -> Result<(), ActorError> {
+        let run_dir = &self.run_dir;
+        let no_address =
+            |error| ActorError::NoAddress { run_dir: run_dir.root().display().to_string(), error };
+        let address: Address = fs::read_to_string(run_dir.address()).map_err(no_address)?.trim().parse()?;
+        let client = transport::connect(&address, run_dir.token()).await?;
+
+        let (outbox, messages) = mpsc::channel(OUTBOX);
+        let hello = Hello {
+            name: self.options.name.clone(),
+            pid: std::process::id(),
+            layout_version: wire::LAYOUT_VERSION,
+            capacity: self.config.actors.episodes_at_once as u32,
+        };
+        outbox.try_send(say(actor_message::Message::Hello(hello))).map_err(|error| gone(&error))?;
+        let answer = RolloutClient::new(client.clone()).join(ReceiverStream::new(messages)).await;
+        let mut from_learner = answer.map_err(|status| refusal(&status))?.into_inner();
+        let welcome = from_learner.message().await.map_err(|status| refusal(&status))?;
+        let Some(learner_message::Message::Welcome(welcome)) = welcome.and_then(|message| message.message)
+        else {
+            return Err(gone(&"it did not say welcome"));
+        };
+        *joined = true;
+
+        let (leases, lease_queue) = mpsc::channel(1);
+        let (done, lease_done) = mpsc::channel(1);
+        let stop = Arc::new(AtomicBool::new(false));
+        let roller = Roller {
+            rit: Arc::clone(&self.rit),
+            rollout: Roller::rollout(&self.config),
+            sender: EpisodeSender::open(&Roller::space(run_dir)?, self.layout.len(), OPEN_TIMEOUT)?,
+            layout: self.layout,
+            run_id: run_dir.run_id(),
+            actor: welcome.actor,
+            weights: Weights::watch(client).await.map_err(RolloutError::Weights)?,
+            stop: Arc::clone(&stop),
+        };
+        let (result, mut rolled) = oneshot::channel();
+        let runtime = tokio::runtime::Handle::current();
+        thread::Builder::new()
+            .name("rollout".into())
+            .spawn(move || {
+                let _ = result.send(roller.run(&runtime, lease_queue, &done));
+            })
+            .map_err(ActorError::Thread)?;
+        tracing::info!(actor = welcome.actor, %address, "joined");
+
+        let conversation = converse(from_learner, outbox, leases, lease_done, leaving);
+        let ended = tokio::select! {
+            ended = conversation => ended,
+            result = &mut rolled => {
+                let error = result.map_err(|_| ActorError::Panicked)?.err();
+                return Err(error.map_or(ActorError::Panicked, Into::into));
+            }
+        };
+        // What is being rolled now is nobody's any more; the thread's place in shared memory must be free again.
+        stop.store(true, Ordering::Relaxed);
+        let _ = rolled.await;
+        ended
+    }
+}
+
+/// Passes leases on and says what is done, until farewell.
+async fn converse(
+    mut from_learner: Streaming<LearnerMessage>,
+    outbox: mpsc::Sender<ActorMessage>,
+    leases: mpsc::Sender<Lease>,
+    mut lease_done: mpsc::Receiver<u64>,
+    leaving: &mut watch::Receiver<bool>,
+) -> Result<(), ActorError> {
     let mut heartbeat = tokio::time::interval(HEARTBEAT_EVERY);
-    let mut leaving = false;
-    tokio::pin!(shutdown);
-    let ended = loop {
+    let mut said = false;
+    loop {
         let message = tokio::select! {
             message = from_learner.message() => match message.map(|message| message.and_then(|m| m.message)) {
                 Ok(Some(learner_message::Message::Lease(lease))) => {
-                    // One lease at a time, so there is room; a thread that has ended is found below.
+                    // One lease at a time, so there is room; a thread that has ended is found by the caller.
                     let _ = leases.send(lease).await;
                     continue;
                 }
-                Ok(Some(learner_message::Message::Farewell(_))) => break Ok(()),
+                Ok(Some(learner_message::Message::Farewell(_))) => return Ok(()),
                 Ok(Some(learner_message::Message::Welcome(_))) => continue,
-                Ok(None) => break Err(gone(&"its stream ended without a farewell")),
-                Err(status) => break Err(gone(&status.message())),
+                Ok(None) => return Err(gone(&"its stream ended without a farewell")),
+                Err(status) => return Err(gone(&status.message())),
             },
             Some(lease) = lease_done.recv() => actor_message::Message::Done(Done { lease }),
-            result = &mut rolled => {
-                return Err(result.map_err(|_| ActorError::Panicked)?.err().map_or(ActorError::Panicked, Into::into));
-            }
-            () = &mut shutdown, if !leaving => {
-                leaving = true;
+            _ = leaving.wait_for(|leaving| *leaving), if !said => {
+                said = true;
                 actor_message::Message::Leaving(Leaving {})
             }
             _ = heartbeat.tick() => actor_message::Message::Heartbeat(Heartbeat {}),
         };
         if outbox.send(say(message)).await.is_err() {
-            break Err(gone(&"it does not listen any more"));
+            return Err(gone(&"it does not listen any more"));
         }
-    };
-    // What is being rolled now is nobody's any more.
-    stop.store(true, Ordering::Relaxed);
-    drop(leases);
-    ended
+    }
+}
+
+fn say(message: actor_message::Message) -> ActorMessage {
+    ActorMessage { message: Some(message) }
+}
+
+fn gone(what: &dyn fmt::Display) -> ActorError {
+    ActorError::LearnerGone(what.to_string())
 }
 
 fn refusal(status: &tonic::Status) -> ActorError {

@@ -36,7 +36,12 @@ pub enum Command {
 #[derive(Args, Debug)]
 pub struct ConfigOptions {
     /// Name of an experiment (see `rit experiments`) or path of a TOML file
-    pub experiment: String,
+    #[arg(required_unless_present = "resume", conflicts_with = "resume")]
+    pub experiment: Option<String>,
+    /// Go on with the run of this directory from its newest checkpoint; keys that do not change the result may be
+    /// set anew, such as --steps or --actors
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["run_dir", "seed"])]
+    pub resume: Option<PathBuf>,
     /// The run's seed: the same seed gives the same weights
     #[arg(long, value_name = "N")]
     pub seed: Option<u64>,

@@ -5,10 +5,11 @@ use rit_algo::{Acting, Rit};
 use rit_config::RunDir;
 use rit_episode::RunSeed;
 use rit_learner::{
-    checkpoint::{self, LATEST, WEIGHTS},
+    checkpoint::{LATEST, WEIGHTS},
     evaluation::{Evaluator, TaskResult},
     metrics::by_task,
     trainer::evaluation_seed,
+    weights_file,
 };
 use std::{process::ExitCode, sync::Arc};
 
@@ -30,12 +31,12 @@ pub fn run(options: &EvaluateOptions) -> Result<ExitCode, Failure> {
         )));
     }
     let rit = Arc::new(Rit::new(config.rit()).map_err(Failure::input)?);
-    let params = checkpoint::load_weights(&path, &rit)?;
+    let params = weights_file::load(&path, &rit)?;
     let episodes = options.episodes.map_or(config.evaluation.episodes, |episodes| episodes as usize);
     let seed = options.seed.map_or_else(|| evaluation_seed(&config), RunSeed);
     let mut acting = Acting::new(Arc::clone(&rit), &params[rit.acting()]);
     let results = evaluator.evaluate(&mut acting, &tasks, episodes, seed);
-    let weights_digest = checkpoint::digest(&params);
+    let weights_digest = weights_file::digest(&params);
     if options.json {
         let output = serde_json::json!({ "weights_digest": weights_digest, "tasks": by_task(&results) });
         println!("{output:#}");

@@ -31,17 +31,14 @@ pub struct Experiment {
     pub config: Config,
 }
 
-/// Resolves what `train` was given.
-///
-/// # Errors
-/// When there is no such experiment or something in it is wrong.
-pub fn from_options(options: &ConfigOptions) -> Result<Experiment, Failure> {
+/// The settings of `train`'s options, beside `--set`.
+pub fn settings(options: &ConfigOptions) -> Vec<String> {
     let mut settings = options.settings.clone();
     settings.extend(options.seed.map(|seed| format!("seed={seed}")));
     settings.extend(options.actors.map(|count| format!("actors.count={count}")));
     settings.extend(options.steps.map(|steps| format!("training.t_max={steps}")));
     settings.extend(options.until.as_ref().map(|until| format!("training.until={until:?}")));
-    load(&options.experiment, &settings)
+    settings
 }
 
 /// Resolves an experiment, by name or by file, under these `section.key=value` settings.
@@ -49,7 +46,7 @@ pub fn from_options(options: &ConfigOptions) -> Result<Experiment, Failure> {
 /// # Errors
 /// When there is no such experiment or something in it is wrong.
 pub fn load(experiment: &str, settings: &[String]) -> Result<Experiment, Failure> {
-    let settings = settings.iter().map(|text| set(text)).collect::<Result<Vec<Table>, _>>()?;
+    let settings = parse_settings(settings)?;
     if let Some((name, text)) = EXPERIMENTS.iter().find(|(name, _)| *name == experiment) {
         return Ok(Experiment { name: (*name).to_owned(), config: resolve(text, name, &settings)? });
     }
@@ -61,6 +58,14 @@ pub fn load(experiment: &str, settings: &[String]) -> Result<Experiment, Failure
         fs::read_to_string(path).map_err(|error| Failure::input_message(format!("{experiment}: {error}")))?;
     let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     Ok(Experiment { name, config: resolve(&text, experiment, &settings)? })
+}
+
+/// `section.key=value` settings as tables.
+///
+/// # Errors
+/// When one is no assignment.
+pub fn parse_settings(settings: &[String]) -> Result<Vec<Table>, Failure> {
+    Ok(settings.iter().map(|text| set(text)).collect::<Result<_, _>>()?)
 }
 
 fn unknown(experiment: &str) -> Failure {

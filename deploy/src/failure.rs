@@ -3,7 +3,7 @@
 use rit_actor::ActorError;
 use rit_config::{ConfigError, RunDirError};
 use rit_env::UnknownName;
-use rit_learner::{LearnerError, checkpoint::CheckpointError};
+use rit_learner::{LearnerError, weights_file::WeightsFileError};
 use rit_proto::transport::ConnectError;
 use std::{fmt, process::ExitCode};
 
@@ -43,12 +43,19 @@ impl Failure {
     /// Prints the message; returns the exit code.
     #[allow(clippy::print_stderr, reason = "the last word of a command")]
     pub fn report(&self) -> ExitCode {
-        let (error, code) = match self {
-            Self::Input(error) => (error, 2),
-            Self::Runtime(error) => (error, 1),
-        };
-        eprintln!("error: {error:#}");
-        ExitCode::from(code)
+        eprintln!("error: {self}");
+        ExitCode::from(match self {
+            Self::Input(_) => 2,
+            Self::Runtime(_) => 1,
+        })
+    }
+}
+
+impl fmt::Display for Failure {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Input(error) | Self::Runtime(error) => write!(f, "{error:#}"),
+        }
     }
 }
 
@@ -70,8 +77,8 @@ impl From<UnknownName> for Failure {
     }
 }
 
-impl From<CheckpointError> for Failure {
-    fn from(error: CheckpointError) -> Self {
+impl From<WeightsFileError> for Failure {
+    fn from(error: WeightsFileError) -> Self {
         Self::input(error)
     }
 }
@@ -89,7 +96,8 @@ impl From<LearnerError> for Failure {
             | LearnerError::Listen(_)
             | LearnerError::RunSpace(_)
             | LearnerError::SharedMemory(_)
-            | LearnerError::Model(_) => Self::input(error),
+            | LearnerError::Model(_)
+            | LearnerError::Checkpoint(_) => Self::input(error),
             _ => Self::runtime(error),
         }
     }

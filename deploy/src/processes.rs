@@ -34,7 +34,7 @@ pub async fn actor(options: ActorOptions, logs: LogOptions) -> Result<ExitCode, 
     let span = logs.start(&options.name)?;
     let (run_dir, config) = RunDir::open(&options.run_dir)?;
     let shutdown = shutdown::requested(options.supervised);
-    let options = rit_actor::ActorOptions { name: options.name };
+    let options = rit_actor::ActorOptions { name: options.name, supervised: options.supervised };
     rit_actor::run(run_dir, config, options, shutdown).instrument(span).await?;
     Ok(ExitCode::SUCCESS)
 }

@@ -56,6 +56,17 @@ impl Process {
         &self.name
     }
 
+    /// Its process, while it lives.
+    pub fn id(&self) -> Option<u32> {
+        self.child.id()
+    }
+
+    /// Kills it; [`Process::wait`] sees its end.
+    pub fn start_kill(&mut self) {
+        // Dead already is as good.
+        let _ = self.child.start_kill();
+    }
+
     /// Waits for its end.
     pub async fn wait(&mut self) -> io::Result<ExitStatus> {
         self.child.wait().await

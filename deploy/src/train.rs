@@ -1,8 +1,8 @@
 //! `rit train`: a learner and its actors on this host, from beginning to end.
 
 use crate::{
-    cli::TrainOptions,
-    experiments,
+    cli::{ConfigOptions, TrainOptions},
+    experiments::{self, Experiment},
     failure::{Failure, INTERRUPTED},
     logging::LogOptions,
     progress::Progress,
@@ -33,27 +33,14 @@ const STATUS_EVERY: Duration = Duration::from_millis(200);
 
 /// `rit train`.
 pub async fn run(options: TrainOptions, logs: LogOptions) -> Result<ExitCode, Failure> {
-    let experiment = experiments::from_options(&options.config)?;
-    let config = experiment.config;
-    if config.actors.count == 0 {
-        return Err(Failure::input_message("actors.count = 0: `rit train` needs at least one actor"));
-    }
-    let run_dir = match &options.config.run_dir {
-        Some(root) => RunDir::create(root, &config)?,
-        None => RunDir::create_fresh(Path::new("runs"), &experiment.name, &config)?,
-    };
+    let (run_dir, config, name) = prepare(&options.config)?;
     let progress = Progress::new(config.training.t_max, options.json);
     let root = run_dir.root().display();
-    progress.say(&format!(
-        "{}: learner and {} actors, run directory {root}",
-        experiment.name, config.actors.count
-    ));
+    progress.say(&format!("{name}: learner and {} actors, run directory {root}", config.actors.count));
 
     let mut run = Run { run_dir: &run_dir, logs: &logs, progress, actors: Vec::new() };
     let ended = run.watch(&config).await;
-    for actor in &mut run.actors {
-        actor.end().await;
-    }
+    run.end_actors().await;
     run.progress.finish();
     remove_shared_memory(&run_dir);
     if matches!(ended, Err(Failure::Input(_))) && !run_dir.metrics().exists() {
@@ -67,6 +54,37 @@ pub async fn run(options: TrainOptions, logs: LogOptions) -> Result<ExitCode, Fa
             Ok(ExitCode::from(INTERRUPTED))
         }
     }
+}
+
+/// A new run's directory, or that of a run to go on with; its configuration and what it is called.
+fn prepare(options: &ConfigOptions) -> Result<(RunDir, Config, String), Failure> {
+    let settings = experiments::settings(options);
+    let (run_dir, config, name) = match (&options.resume, &options.experiment) {
+        (Some(root), _) => {
+            let (run_dir, config) = RunDir::resume(root, &experiments::parse_settings(&settings)?)?;
+            let name = format!("going on with {}", config.environment.task_set);
+            (run_dir, config, name)
+        }
+        (None, Some(experiment)) => {
+            let Experiment { name, config } = experiments::load(experiment, &settings)?;
+            refuse_no_actors(&config)?;
+            let run_dir = match &options.run_dir {
+                Some(root) => RunDir::create(root, &config)?,
+                None => RunDir::create_fresh(Path::new("runs"), &name, &config)?,
+            };
+            (run_dir, config, name)
+        }
+        (None, None) => return Err(Failure::input_message("which experiment? `rit experiments` lists them")),
+    };
+    refuse_no_actors(&config)?;
+    Ok((run_dir, config, name))
+}
+
+fn refuse_no_actors(config: &Config) -> Result<(), Failure> {
+    if config.actors.count > 0 {
+        return Ok(());
+    }
+    Err(Failure::input_message("actors.count = 0: `rit train` needs at least one actor"))
 }
 
 /// How a run came to its end in order.
@@ -85,13 +103,11 @@ struct Run<'a> {
 
 impl Run<'_> {
     async fn watch(&mut self, config: &Config) -> Result<Ended, Failure> {
+        // What a learner that was killed with everything else has left behind.
+        let _ = fs::remove_file(self.run_dir.address());
         let mut learner = self.start("learner", &["learner"])?;
         let mut control = self.control(&mut learner).await?;
-        for index in 0..config.actors.count {
-            let name = format!("actor-{index}");
-            let actor = self.start(&name, &["actor", "--name", &name])?;
-            self.actors.push(actor);
-        }
+        self.start_actors(config.actors.count)?;
         let mut ticks = tokio::time::interval(STATUS_EVERY);
         let interrupted = shutdown::requested(false);
         tokio::pin!(interrupted);
@@ -100,15 +116,22 @@ impl Run<'_> {
             tokio::select! {
                 status = learner.wait() => {
                     let status = status.map_err(Failure::runtime)?;
-                    let ended = if stopping { Ended::Interrupted } else { Ended::Finished };
-                    return if status.success() { Ok(ended) } else { Err(died(&learner, status)) };
+                    if status.success() {
+                        return Ok(if stopping { Ended::Interrupted } else { Ended::Finished });
+                    }
+                    // What it said itself would be no better a second time; what ended it from outside may be.
+                    if stopping || status.code().is_some() {
+                        return Err(died(&learner, status));
+                    }
+                    control = self.restart_learner(&mut learner, status, config).await?;
                 }
                 (index, status) = any_actor(&mut self.actors) => {
                     self.actor_ended(index, status, &mut learner, stopping).await?;
                 }
                 _ = ticks.tick() => {
-                    // A learner that is ending does not answer; its end is seen above.
+                    // A learner that is ending or has just died does not answer; its end is seen above.
                     if let Ok(status) = ask(&mut control).await {
+                        self.kill_hung_actors(&status);
                         self.progress.update(&status);
                     }
                 }
@@ -117,6 +140,61 @@ impl Run<'_> {
                     self.progress.say("interrupted: ending the run in order");
                     let _ = control.stop(StopRequest {}).await;
                 }
+            }
+        }
+    }
+
+    fn start_actors(&mut self, count: usize) -> Result<(), Failure> {
+        for index in self.actors.len()..count {
+            let name = format!("actor-{index}");
+            let actor = self.start(&name, &["actor", "--name", &name])?;
+            self.actors.push(actor);
+        }
+        Ok(())
+    }
+
+    async fn end_actors(&mut self) {
+        for actor in &mut self.actors {
+            actor.end().await;
+        }
+        self.actors.clear();
+    }
+
+    /// Starts the learner again, which goes on from its newest checkpoint. Actors find it by themselves; only if
+    /// it cannot begin beside them is everything started anew.
+    async fn restart_learner(
+        &mut self,
+        learner: &mut Process,
+        status: ExitStatus,
+        config: &Config,
+    ) -> Result<ControlClient<Client>, Failure> {
+        self.progress.say(&format!("the learner {} and is restarted", in_words(status)));
+        // Else the dead one's address would be taken for the new one's.
+        let _ = fs::remove_file(self.run_dir.address());
+        loop {
+            learner.restart()?;
+            match self.control(learner).await {
+                Ok(control) => {
+                    self.start_actors(config.actors.count)?;
+                    return Ok(control);
+                }
+                Err(error) => {
+                    self.progress.say(&format!("{error}; the actors are started anew too"));
+                    self.end_actors().await;
+                    learner.end().await;
+                    remove_shared_memory(self.run_dir);
+                }
+            }
+        }
+    }
+
+    /// A hung actor is of no use; when it is dead it is restarted like any other.
+    fn kill_hung_actors(&mut self, status: &RunStatus) {
+        for hung in status.actors.iter().filter(|actor| actor.hung) {
+            if let Some(actor) = self.actors.iter_mut().find(|actor| actor.id() == Some(hung.pid)) {
+                self.progress
+                    .say(&format!("{} has hung for {:.0} s and is killed", hung.name, hung.silent_s));
+                actor.start_kill();
             }
         }
     }

@@ -45,7 +45,7 @@ fn forged_frames_are_counted_and_never_reach_replay() {
 
     let status = train.wait_for("the refusals", |status| {
         let refused = status["ledger"]["frames_refused"].as_object().unwrap();
-        refused.values().filter_map(|count| count.as_u64()).sum::<u64>() == 3
+        refused.values().filter_map(serde_json::Value::as_u64).sum::<u64>() == 3
     });
     let refused = &status["ledger"]["frames_refused"];
     assert_eq!(

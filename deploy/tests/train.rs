@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{RunFolder, json_lines, kill, pids, shared_memory_of, wait_until_gone};
+use common::{RunFolder, json_lines, pids, shared_memory_of, wait_until_gone};
 use rustix::process::Signal;
 use serde_json::Value;
 use std::os::unix::fs::PermissionsExt as _;
@@ -66,41 +66,6 @@ fn the_same_seed_gives_the_same_weights_whoever_rolls() {
     assert!(alone == digest(&["--actors", "3"]), "three actors");
     assert!(alone == digest(&["--actors", "1", "--set", "learner.threads=1"]), "one thread");
     assert_ne!(alone.0, digest(&["--actors", "1", "--seed", "4"]).0, "another seed");
-}
-
-#[test]
-fn a_killed_actor_is_restarted_and_changes_nothing() {
-    let undisturbed = RunFolder::new().train(&short(&["--actors", "1"]));
-    let folder = RunFolder::new();
-    let mut train = folder.start(&short(&["--actors", "2"]));
-    let is_there = |status: &Value, name: &str| {
-        let actors = status["actors"].as_array().unwrap();
-        actors.iter().find(|actor| actor["name"] == name).map(|actor| actor["pid"].as_u64().unwrap() as u32)
-    };
-    // Both must be gone and come back at least once for the run to go on.
-    for name in ["actor-0", "actor-1"] {
-        let status = train.wait_for(name, |status| is_there(status, name).is_some());
-        let victim = is_there(&status, name).unwrap();
-        kill(victim, Signal::KILL);
-        train.wait_for("its successor", |status| is_there(status, name).is_some_and(|pid| pid != victim));
-    }
-    assert_eq!(train.finish()["weights_digest"], undisturbed["weights_digest"]);
-    assert!(shared_memory_of(&folder.run_dir()).is_empty());
-}
-
-#[test]
-fn a_dead_learner_ends_the_run_plainly() {
-    let folder = RunFolder::new();
-    let mut train = folder.start(&["matrix-game", "--actors", "2"]);
-    let status = train.wait_for("training", |status| status["updates"].as_u64() > Some(0));
-    let processes = pids(&status);
-    kill(processes[0], Signal::KILL);
-    let output = train.wait();
-    assert_eq!(output.status.code(), Some(1));
-    let stderr = String::from_utf8_lossy(&output.stderr);
-    assert!(stderr.contains("error: the learner was ended by signal 9"), "{stderr}");
-    assert!(shared_memory_of(&folder.run_dir()).is_empty());
-    processes.into_iter().for_each(wait_until_gone);
 }
 
 #[test]

@@ -1,15 +1,32 @@
-//! Weights on disk: safetensors under the specification's parameter names.
+//! Checkpoints: all that training needs to go on as if it had never stopped.
 //!
-//! A checkpoint is a folder, written beside its place, made durable and then renamed there, so it is whole or
-//! not there. `checkpoints/latest` is a link to the newest.
+//! A checkpoint is a folder `checkpoints/step-…`:
+//!
+//! | file | what it holds |
+//! |---|---|
+//! | `weights.safetensors` | the weights, under the specification's names |
+//! | `state.safetensors` | target network, optimiser moments, the acting weights that open batches are rolled with |
+//! | `checkpoint.json` | progress, the terms of open batches, positions in other files |
+//! | `SHA256SUMS` | of the files above; `sha256sum --check SHA256SUMS` |
+//!
+//! Replay lies beside them in `replay/`, written as it grows (see [`crate::replay_log`]). Random streams need no
+//! place: they follow from the seed and the progress. A folder is written beside its place, made durable and
+//! then renamed there, so it is whole or not there. `checkpoints/latest` is a link to the newest.
 
+use crate::{
+    evaluation::TaskResult,
+    ledger::Terms,
+    replay_log::{self, ReplayLogError, remedy},
+    weights::Snapshot,
+    weights_file::{self, WeightsFileError},
+};
 use rit_algo::Rit;
 use rit_config::RunDir;
+use rit_episode::{Episode, wire::Expected};
 use safetensors::{Dtype, SafeTensorError, SafeTensors, tensor::TensorView};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 use std::{
-    collections::HashMap,
     fs::{self, File},
     io::{self, Write as _},
     os::unix::fs::symlink,
@@ -18,14 +35,15 @@ use std::{
 
 /// The weights' file inside a checkpoint.
 pub const WEIGHTS: &str = "weights.safetensors";
-/// The progress' file inside a checkpoint.
-const PROGRESS: &str = "progress.json";
+const STATE: &str = "state.safetensors";
+const MANIFEST: &str = "checkpoint.json";
+const SUMS: &str = "SHA256SUMS";
 /// The link to the newest checkpoint.
 pub const LATEST: &str = "latest";
-/// The key of the weights' digest in the file's metadata.
-const DIGEST: &str = "digest";
+/// What a folder is called while it is written.
+const PARTIAL: &str = "partial";
 
-/// How far training had come.
+/// How far training has come.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Progress {
     /// Environment steps collected.
@@ -36,231 +54,465 @@ pub struct Progress {
     pub updates: u64,
 }
 
+/// All that training needs to go on, but for replay.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TrainingState {
+    /// θ, ω, σ, φ.
+    pub params: Vec<f32>,
+    /// The target network's θ, ω, σ.
+    pub target: Vec<f32>,
+    /// The optimiser's mean of gradients; empty for RMSprop.
+    pub mean: Vec<f32>,
+    /// The optimiser's mean of squared gradients.
+    pub mean_square: Vec<f32>,
+    /// The acting weights that the terms name.
+    pub snapshots: Vec<Snapshot>,
+    /// The rest.
+    pub manifest: Manifest,
+}
+
+/// The small part of a checkpoint, as it stands in `checkpoint.json`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Manifest {
+    /// How far training has come. Optimiser steps are updates.
+    #[serde(flatten)]
+    pub progress: Progress,
+    /// Collected episodes when the target network was last copied.
+    pub target_copied_at: u64,
+    /// What the next batches are rolled with, in order.
+    pub terms: Vec<Terms>,
+    /// Versions and environment steps of the acting weights kept.
+    pub snapshots: Vec<SnapshotMark>,
+    /// (return, won) of exploring episodes of late, by task.
+    pub recent: Vec<Vec<(f64, bool)>>,
+    /// Length of `metrics.jsonl`, in bytes.
+    pub metrics_len: u64,
+    /// Seconds the learner has run.
+    pub wall_s: f64,
+    /// The newest scheduled evaluation: task by task.
+    pub evaluation: Option<(Progress, Vec<(String, TaskResult)>)>,
+    /// Digest of the weights.
+    pub weights_digest: String,
+}
+
+/// Names one of the acting weights kept.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SnapshotMark {
+    /// Updates that made them.
+    pub version: u64,
+    /// Environment steps collected by then.
+    pub env_steps: u64,
+}
+
 /// Why a checkpoint cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
     /// The system refused.
-    #[error("{path}: {error}")]
+    #[error("{path}: {error}{}", remedy(error))]
     Io {
         /// The file or folder.
         path: PathBuf,
         /// Why.
         error: io::Error,
     },
-    /// Not a whole safetensors file.
-    #[error(
-        "{path} is no whole safetensors file ({error}); it was truncated or altered: use another checkpoint"
-    )]
+    /// The weights.
+    #[error(transparent)]
+    Weights(#[from] WeightsFileError),
+    /// Replay.
+    #[error(transparent)]
+    Replay(#[from] ReplayLogError),
+    /// Tensors that cannot be written or read.
+    #[error("{path} is no whole safetensors file ({error}); it was truncated or altered")]
     Format {
         /// The file.
         path: PathBuf,
         /// What is wrong with it.
         error: SafeTensorError,
     },
-    /// Weights of another model.
-    #[error(
-        "{path} holds weights of another model: {difference}; use the configuration they were trained with"
-    )]
-    OtherModel {
-        /// The file.
-        path: PathBuf,
-        /// The first difference.
-        difference: String,
-    },
-    /// Numbers that are not those that were written.
-    #[error("{path} was altered: its weights have not the digest it carries; use another checkpoint")]
+    /// A file that is not what was written.
+    #[error("{path} was altered: its SHA-256 is not the one in {SUMS}")]
     Altered {
         /// The file.
         path: PathBuf,
     },
+    /// Sizes or contents that make no state.
+    #[error("{path}: {what}")]
+    Inconsistent {
+        /// The file.
+        path: PathBuf,
+        /// What does not fit.
+        what: String,
+    },
+    /// Checkpoints there are, and none can be used.
+    #[error("no checkpoint in {folder} can be used; the newest: {newest}")]
+    NoneUsable {
+        /// The folder of all checkpoints.
+        folder: PathBuf,
+        /// What is wrong with the newest.
+        newest: Box<CheckpointError>,
+    },
 }
 
-/// SHA-256 of the weights as little-endian f32 in the layout's order, in hexadecimal.
-pub fn digest(params: &[f32]) -> String {
-    let mut hasher = Sha256::new();
-    for part in params.chunks(4096) {
-        hasher.update(to_bytes(part));
-    }
-    hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
-fn to_bytes(params: &[f32]) -> Vec<u8> {
-    params.iter().flat_map(|x| x.to_le_bytes()).collect()
-}
-
-/// Writes a checkpoint and points `latest` to it. Returns its folder, relative to the run directory.
+/// Writes a checkpoint, points `latest` to it and removes all but the newest `keep`. Returns its folder, relative
+/// to the run directory. Replay up to it must be durable already.
 ///
 /// # Errors
 /// When the disk refuses; the checkpoints before are left as they were.
 pub fn save(
     run_dir: &RunDir,
     rit: &Rit,
-    params: &[f32],
-    progress: Progress,
+    state: &TrainingState,
+    keep: usize,
 ) -> Result<PathBuf, CheckpointError> {
-    let name = format!("step-{:012}", progress.env_steps);
-    let folder = run_dir.checkpoints().join(&name);
-    let partial = run_dir.checkpoints().join(format!("{name}.partial"));
-    let io = |path: &Path| {
-        let path = path.to_owned();
-        move |error| CheckpointError::Io { path, error }
-    };
+    let all = run_dir.checkpoints();
+    let name = format!("step-{:012}", state.manifest.progress.env_steps);
+    let (folder, partial) = (all.join(&name), all.join(format!("{name}.{PARTIAL}")));
     if partial.exists() {
         fs::remove_dir_all(&partial).map_err(io(&partial))?;
     }
     fs::create_dir(&partial).map_err(io(&partial))?;
-    let write = |name: &str, bytes: &[u8]| {
-        let path = partial.join(name);
-        let written = File::create(&path).and_then(|mut file| {
-            file.write_all(bytes)?;
-            file.sync_all()
-        });
-        written.map_err(io(&path))
-    };
-    write(WEIGHTS, &encode(rit, params, &partial.join(WEIGHTS))?)?;
-    let text = serde_json::to_vec_pretty(&progress);
-    write(PROGRESS, &text.map_err(|error| io(&partial.join(PROGRESS))(error.into()))?)?;
-    sync_folder(&partial).map_err(io(&partial))?;
-    if folder.exists() {
-        // The same step once more, by request: the same content under the same name.
-        fs::remove_dir_all(&folder).map_err(io(&folder))?;
+    let written = write_folder(&partial, rit, state);
+    if written.is_err() {
+        // What could not be written whole takes no space. If that fails too, the next attempt removes it.
+        let _ = fs::remove_dir_all(&partial);
     }
-    fs::rename(&partial, &folder).map_err(io(&folder))?;
+    written?;
+    if folder.exists() {
+        // The same step once more, by request or after a damaged one.
+        let old = folder.with_extension(PARTIAL);
+        fs::rename(&partial, folder.with_extension("new")).map_err(io(&partial))?;
+        fs::rename(&folder, &old).map_err(io(&folder))?;
+        fs::rename(folder.with_extension("new"), &folder).map_err(io(&folder))?;
+        fs::remove_dir_all(&old).map_err(io(&old))?;
+    } else {
+        fs::rename(&partial, &folder).map_err(io(&folder))?;
+    }
     // A link cannot be replaced in place; a new one can be renamed over it.
-    let (link, new_link) = (run_dir.checkpoints().join(LATEST), run_dir.checkpoints().join("latest.partial"));
+    let (link, new_link) = (all.join(LATEST), all.join(format!("{LATEST}.{PARTIAL}")));
     let _ = fs::remove_file(&new_link);
     symlink(&name, &new_link).and_then(|()| fs::rename(&new_link, &link)).map_err(io(&link))?;
-    sync_folder(&run_dir.checkpoints()).map_err(io(&run_dir.checkpoints()))?;
+    sync(&all)?;
+    for old in folders(&all)?.into_iter().rev().skip(keep.max(1)) {
+        fs::remove_dir_all(&old).map_err(io(&old))?;
+    }
     Ok(Path::new("checkpoints").join(name))
 }
 
-fn sync_folder(path: &Path) -> io::Result<()> {
-    File::open(path)?.sync_all()
-}
-
-fn encode(rit: &Rit, params: &[f32], path: &Path) -> Result<Vec<u8>, CheckpointError> {
-    let bytes = to_bytes(params);
-    let format = |error| CheckpointError::Format { path: path.to_owned(), error };
-    let mut tensors = Vec::new();
-    for param in rit.layout.params() {
-        let data = &bytes[4 * param.range.start..4 * param.range.end];
-        let view = TensorView::new(Dtype::F32, param.shape.clone(), data).map_err(format)?;
-        tensors.push((param.name.as_str(), view));
+fn write_folder(folder: &Path, rit: &Rit, state: &TrainingState) -> Result<(), CheckpointError> {
+    let format = |name: &str| {
+        let path = folder.join(name);
+        move |error| CheckpointError::Format { path, error }
+    };
+    let manifest = serde_json::to_vec_pretty(&state.manifest);
+    let manifest = manifest.map_err(|error| io(&folder.join(MANIFEST))(error.into()))?;
+    let files = [
+        (WEIGHTS, weights_file::encode(rit, &state.params).map_err(format(WEIGHTS))?),
+        (STATE, encode_state(state).map_err(format(STATE))?),
+        (MANIFEST, manifest),
+    ];
+    let mut sums = String::new();
+    for (name, bytes) in &files {
+        sums += &format!("{}  {name}\n", sha256(bytes));
+        write(&folder.join(name), bytes)?;
     }
-    // One key alone: a map of several would be written in any order.
-    let metadata = HashMap::from([(DIGEST.to_owned(), digest(params))]);
-    safetensors::serialize(tensors, Some(metadata)).map_err(format)
+    write(&folder.join(SUMS), sums.as_bytes())?;
+    sync(folder)
 }
 
-/// Reads weights for this model.
+fn write(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
+    let written = File::create(path).and_then(|mut file| {
+        file.write_all(bytes)?;
+        file.sync_all()
+    });
+    written.map_err(io(path))
+}
+
+fn sync(folder: &Path) -> Result<(), CheckpointError> {
+    File::open(folder).and_then(|folder| folder.sync_all()).map_err(io(folder))
+}
+
+fn io(path: &Path) -> impl FnOnce(io::Error) -> CheckpointError {
+    let path = path.to_owned();
+    move |error| CheckpointError::Io { path, error }
+}
+
+/// A checkpoint that training goes on from.
+#[derive(Debug)]
+pub struct Loaded {
+    /// Its folder.
+    pub folder: PathBuf,
+    /// All but replay.
+    pub state: TrainingState,
+    /// Replay, oldest first.
+    pub replay: Vec<Episode>,
+    /// What was wrong with newer ones.
+    pub damaged: Vec<CheckpointError>,
+}
+
+/// The newest checkpoint that is whole, with replay's last `buffer_size` episodes; `None` where none was ever
+/// written.
 ///
 /// # Errors
-/// When the file is not there, not whole, altered, or of another model.
-pub fn load_weights(path: &Path, rit: &Rit) -> Result<Vec<f32>, CheckpointError> {
-    let path = path.to_owned();
-    let bytes = fs::read(&path).map_err(|error| CheckpointError::Io { path: path.clone(), error })?;
-    let format = |error| CheckpointError::Format { path: path.clone(), error };
-    let tensors = SafeTensors::deserialize(&bytes).map_err(format)?;
-    let other = |difference| CheckpointError::OtherModel { path: path.clone(), difference };
-    let mut params = Vec::with_capacity(rit.layout.len());
-    for param in rit.layout.params() {
-        let Ok(tensor) = tensors.tensor(&param.name) else {
-            return Err(other(format!("there is no {}", param.name)));
-        };
-        if tensor.dtype() != Dtype::F32 || tensor.shape() != param.shape {
-            let (found, expected) = (tensor.shape(), &param.shape);
-            return Err(other(format!(
-                "{} is {found:?} {:?}, not {expected:?} F32",
-                param.name,
-                tensor.dtype()
-            )));
+/// When there are checkpoints and none can be used.
+pub fn load_newest(
+    run_dir: &RunDir,
+    rit: &Rit,
+    expected: &Expected,
+    buffer_size: usize,
+) -> Result<Option<Loaded>, CheckpointError> {
+    let all = run_dir.checkpoints();
+    let mut damaged = Vec::new();
+    for folder in folders(&all)?.into_iter().rev() {
+        let loaded = load(&folder, rit).and_then(|state| {
+            let end = state.manifest.progress.episodes;
+            let numbers = end.saturating_sub(buffer_size as u64)..end;
+            let replay = replay_log::read(&run_dir.replay(), expected, numbers)?;
+            Ok((state, replay))
+        });
+        match loaded {
+            Ok((state, replay)) => return Ok(Some(Loaded { folder, state, replay, damaged })),
+            Err(error) => damaged.push(error),
         }
-        params.extend(tensor.data().as_chunks::<4>().0.iter().map(|&word| f32::from_le_bytes(word)));
     }
-    if let Some(name) =
-        tensors.names().iter().find(|name| !rit.layout.params().iter().any(|p| p.name == **name))
-    {
-        return Err(other(format!("there is {name} too")));
+    if damaged.is_empty() {
+        return Ok(None);
     }
-    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(format)?;
-    let carried = header.metadata().as_ref().and_then(|metadata| metadata.get(DIGEST));
-    if carried.is_some_and(|carried| *carried != digest(&params)) {
-        return Err(CheckpointError::Altered { path });
+    Err(CheckpointError::NoneUsable { folder: all, newest: Box::new(damaged.swap_remove(0)) })
+}
+
+/// Reads one checkpoint's folder.
+///
+/// # Errors
+/// When anything in it is not what was written.
+pub fn load(folder: &Path, rit: &Rit) -> Result<TrainingState, CheckpointError> {
+    let read = |name: &str| fs::read(folder.join(name)).map_err(io(&folder.join(name)));
+    let sums = String::from_utf8_lossy(&read(SUMS)?).into_owned();
+    let checked = |name: &str| {
+        let bytes = read(name)?;
+        let line = format!("{}  {name}", sha256(&bytes));
+        if sums.lines().any(|known| known == line) {
+            Ok(bytes)
+        } else {
+            Err(CheckpointError::Altered { path: folder.join(name) })
+        }
+    };
+    let inconsistent =
+        |name: &str, what: String| CheckpointError::Inconsistent { path: folder.join(name), what };
+    let manifest: Manifest = serde_json::from_slice(&checked(MANIFEST)?)
+        .map_err(|error| inconsistent(MANIFEST, error.to_string()))?;
+    checked(WEIGHTS)?;
+    let params = weights_file::load(&folder.join(WEIGHTS), rit)?;
+    let bytes = checked(STATE)?;
+    let format = |error| CheckpointError::Format { path: folder.join(STATE), error };
+    let tensors = SafeTensors::deserialize(&bytes).map_err(format)?;
+    let tensor = |name: &str, len: usize| {
+        let tensor = tensors.tensor(name).map_err(format)?;
+        let (words, _) = tensor.data().as_chunks::<4>();
+        if tensor.dtype() != Dtype::F32 || words.len() != len {
+            return Err(inconsistent(STATE, format!("{name} has {} numbers, not {len}", words.len())));
+        }
+        Ok(words.iter().map(|&word| f32::from_le_bytes(word)).collect::<Vec<f32>>())
+    };
+    let mut snapshots = Vec::new();
+    for SnapshotMark { version, env_steps } in &manifest.snapshots {
+        let params = tensor(&snapshot_name(*version), rit.acting().len())?;
+        snapshots.push(Snapshot::new(*version, *env_steps, &params));
     }
-    Ok(params)
+    // RMSprop has no mean.
+    let mean_len =
+        if tensors.tensor(MEAN).is_ok_and(|mean| mean.data().is_empty()) { 0 } else { params.len() };
+    Ok(TrainingState {
+        target: tensor(TARGET, rit.target().len())?,
+        mean: tensor(MEAN, mean_len)?,
+        mean_square: tensor(MEAN_SQUARE, params.len())?,
+        snapshots,
+        params,
+        manifest,
+    })
+}
+
+const TARGET: &str = "target";
+const MEAN: &str = "optimizer.mean";
+const MEAN_SQUARE: &str = "optimizer.mean_square";
+
+fn snapshot_name(version: u64) -> String {
+    format!("acting.{version}")
+}
+
+fn encode_state(state: &TrainingState) -> Result<Vec<u8>, SafeTensorError> {
+    let bytes = |numbers: &[f32]| numbers.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>();
+    let mut tensors = vec![
+        (TARGET.to_owned(), bytes(&state.target)),
+        (MEAN.to_owned(), bytes(&state.mean)),
+        (MEAN_SQUARE.to_owned(), bytes(&state.mean_square)),
+    ];
+    for snapshot in &state.snapshots {
+        tensors.push((snapshot_name(snapshot.version), snapshot.params.to_vec()));
+    }
+    let views = tensors.iter().map(|(name, bytes)| {
+        TensorView::new(Dtype::F32, vec![bytes.len() / 4], bytes).map(|view| (name.as_str(), view))
+    });
+    safetensors::serialize(views.collect::<Result<Vec<_>, _>>()?, None)
+}
+
+/// The checkpoints' folders, oldest first.
+fn folders(all: &Path) -> Result<Vec<PathBuf>, CheckpointError> {
+    let mut folders = Vec::new();
+    for entry in fs::read_dir(all).map_err(io(all))? {
+        let name = entry.map_err(io(all))?.file_name();
+        let steps = name.to_str().and_then(|name| name.strip_prefix("step-"));
+        if steps.is_some_and(|steps| steps.bytes().all(|byte| byte.is_ascii_digit())) {
+            folders.push(all.join(name));
+        }
+    }
+    folders.sort();
+    Ok(folders)
+}
+
+/// Episode numbers that the oldest checkpoint kept needs of replay: all from here on.
+///
+/// # Errors
+/// When the folder cannot be read.
+pub fn replay_needed_from(run_dir: &RunDir, buffer_size: usize) -> Result<u64, CheckpointError> {
+    let oldest = folders(&run_dir.checkpoints())?.into_iter().next();
+    let episodes = oldest.and_then(|folder| {
+        let manifest: Manifest = serde_json::from_slice(&fs::read(folder.join(MANIFEST)).ok()?).ok()?;
+        Some(manifest.progress.episodes)
+    });
+    // One that cannot be read keeps everything: another may yet be needed.
+    Ok(episodes.map_or(0, |episodes| episodes.saturating_sub(buffer_size as u64)))
+}
+
+fn sha256(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use rit_episode::{RunSeed, Stream};
+    use rit_episode::{RunSeed, Stream, wire::PayloadLayout};
 
-    fn run(settings: &[&str]) -> (tempfile::TempDir, RunDir, Rit, Vec<f32>) {
-        let settings: Vec<_> = settings.iter().map(|text| rit_config::set(text).unwrap()).collect();
-        let config =
-            rit_config::resolve("environment.task_set = \"matrix-game\"", "test", &settings).unwrap();
+    struct Run {
+        _folder: tempfile::TempDir,
+        run_dir: RunDir,
+        rit: Rit,
+    }
+
+    fn run() -> Run {
+        let config = rit_config::resolve("environment.task_set = \"matrix-game\"", "test", &[]).unwrap();
         let folder = tempfile::tempdir().unwrap();
         let run_dir = RunDir::create(&folder.path().join("run"), &config).unwrap();
-        let rit = Rit::new(config.rit()).unwrap();
-        let params = rit.layout.initial(&mut RunSeed(1).stream(Stream::Weights, 0));
-        (folder, run_dir, rit, params)
+        Run { _folder: folder, run_dir, rit: Rit::new(config.rit()).unwrap() }
     }
 
-    #[test]
-    fn weights_come_back_and_latest_is_the_newest() {
-        let (_folder, run_dir, rit, mut params) = run(&[]);
-        let progress = |env_steps| Progress { env_steps, episodes: 3, updates: 2 };
-        let first = save(&run_dir, &rit, &params, progress(50)).unwrap();
-        assert_eq!(first, Path::new("checkpoints/step-000000000050"));
-        params[17] += 1.0;
-        save(&run_dir, &rit, &params, progress(100)).unwrap();
-        save(&run_dir, &rit, &params, progress(100)).unwrap();
-        let latest = run_dir.checkpoints().join(LATEST);
-        assert_eq!(load_weights(&latest.join(WEIGHTS), &rit).unwrap(), params);
-        assert_ne!(load_weights(&run_dir.root().join(first).join(WEIGHTS), &rit).unwrap(), params);
-        let partial = fs::read_dir(run_dir.checkpoints()).unwrap();
-        assert!(partial.flatten().all(|entry| !entry.file_name().to_string_lossy().contains("partial")));
-    }
-
-    #[test]
-    fn the_same_weights_make_the_same_bytes() {
-        let (_folder, run_dir, rit, params) = run(&[]);
-        let bytes = |env_steps| {
-            let progress = Progress { env_steps, ..Progress::default() };
-            let folder = save(&run_dir, &rit, &params, progress).unwrap();
-            fs::read(run_dir.root().join(folder).join(WEIGHTS)).unwrap()
-        };
-        assert_eq!(bytes(1), bytes(2));
-    }
-
-    #[test]
-    fn what_is_not_these_weights_is_refused_and_named() {
-        let (_folder, run_dir, rit, params) = run(&[]);
-        save(&run_dir, &rit, &params, Progress::default()).unwrap();
-        let path = run_dir.checkpoints().join(LATEST).join(WEIGHTS);
-        let good = fs::read(&path).unwrap();
-        let error = |rit: &Rit| load_weights(&path, rit).unwrap_err().to_string();
-
-        let (.., other, _) = run(&["network.hidden_dim=32"]);
-        assert!(
-            error(&other).contains("utility.embed.weight is [64, 6] F32, not [32, 6] F32"),
-            "{}",
-            error(&other)
-        );
-        let (.., sum, _) = run(&["algorithm.mixing=sum"]);
-        assert!(error(&sum).contains("there is mixer."));
-        let (.., no_z, _) = run(&["algorithm.task_representations=false"]);
-        assert!(error(&no_z).contains("utility.head_hidden.weight is [64, 160]"));
-
-        for length in [0, 4, 8, 100, good.len() / 2, good.len() - 1] {
-            fs::write(&path, &good[..length]).unwrap();
-            assert!(error(&rit).contains("no whole safetensors file"), "{length}");
+    impl Run {
+        /// A state whose numbers tell which it is. It needs no replay.
+        fn state(&self, env_steps: u64) -> TrainingState {
+            let numbers = |len: usize, index: u64| -> Vec<f32> {
+                let layout = self.rit.layout.initial(&mut RunSeed(env_steps).stream(Stream::Weights, index));
+                layout.into_iter().cycle().take(len).collect()
+            };
+            let params = numbers(self.rit.layout.len(), 0);
+            let acting = numbers(self.rit.acting().len(), 1);
+            TrainingState {
+                target: numbers(self.rit.target().len(), 2),
+                mean: vec![],
+                mean_square: numbers(params.len(), 3),
+                snapshots: vec![Snapshot::new(4, 90, &acting), Snapshot::new(5, 100, &acting)],
+                manifest: Manifest {
+                    progress: Progress { env_steps, episodes: 0, updates: 5 },
+                    target_copied_at: 3,
+                    terms: vec![Terms { weights_version: 4, epsilon: 0.1 + 0.2 }],
+                    snapshots: [(4, 90), (5, 100)]
+                        .map(|(version, env_steps)| SnapshotMark { version, env_steps })
+                        .to_vec(),
+                    recent: vec![vec![(0.1 + 0.2, true)], vec![]],
+                    metrics_len: 77,
+                    wall_s: 1.5,
+                    evaluation: None,
+                    weights_digest: weights_file::digest(&params),
+                },
+                params,
+            }
         }
-        let mut altered = good.clone();
-        *altered.last_mut().unwrap() ^= 1;
-        fs::write(&path, altered).unwrap();
-        assert!(error(&rit).contains("was altered"));
-        fs::remove_file(&path).unwrap();
-        assert!(error(&rit).contains("No such file"));
+
+        fn save(&self, env_steps: u64) -> PathBuf {
+            self.run_dir.root().join(save(&self.run_dir, &self.rit, &self.state(env_steps), 3).unwrap())
+        }
+
+        fn load(&self) -> Result<Option<Loaded>, CheckpointError> {
+            let dims = rit_env::TaskSet::MatrixGame.dims();
+            let layout = PayloadLayout::new(dims);
+            let expected = Expected { run_id: self.run_dir.run_id(), layout, tasks: vec![] };
+            load_newest(&self.run_dir, &self.rit, &expected, 10)
+        }
+    }
+
+    #[test]
+    fn a_state_comes_back_whole_and_latest_is_the_newest() {
+        let run = run();
+        assert!(run.load().unwrap().is_none(), "none was ever written");
+        run.save(50);
+        run.save(100);
+        let loaded = run.load().unwrap().unwrap();
+        assert_eq!(loaded.state, run.state(100));
+        assert!(loaded.damaged.is_empty());
+        let latest = run.run_dir.checkpoints().join(LATEST);
+        assert_eq!(load(&latest, &run.rit).unwrap(), run.state(100));
+        run.save(100);
+        assert_eq!(run.load().unwrap().unwrap().state, run.state(100), "once more by request");
+    }
+
+    #[test]
+    fn only_the_last_few_are_kept() {
+        let run = run();
+        for env_steps in [10, 20, 30, 40, 50] {
+            run.save(env_steps);
+        }
+        let kept = folders(&run.run_dir.checkpoints()).unwrap();
+        let names: Vec<_> = kept.iter().map(|path| path.file_name().unwrap().to_str().unwrap()).collect();
+        assert_eq!(names, ["step-000000000030", "step-000000000040", "step-000000000050"]);
+    }
+
+    #[test]
+    fn a_damaged_newest_is_reported_and_the_one_before_is_used() {
+        for name in [WEIGHTS, STATE, MANIFEST, SUMS] {
+            let run = run();
+            run.save(10);
+            let newest = run.save(20);
+            let path = newest.join(name);
+            let mut bytes = fs::read(&path).unwrap();
+            let middle = bytes.len() / 2;
+            bytes[middle] ^= 1;
+            fs::write(&path, bytes).unwrap();
+            let loaded = run.load().unwrap().unwrap();
+            assert_eq!(loaded.state, run.state(10), "{name}");
+            assert!(loaded.damaged[0].to_string().contains("was altered"), "{name}: {}", loaded.damaged[0]);
+            fs::remove_file(&path).unwrap();
+            assert!(run.load().unwrap().unwrap().damaged[0].to_string().contains("No such file"), "{name}");
+        }
+    }
+
+    #[test]
+    fn what_was_half_written_is_nothing() {
+        let run = run();
+        run.save(10);
+        let partial = run.run_dir.checkpoints().join("step-000000000020.partial");
+        fs::create_dir(&partial).unwrap();
+        fs::write(partial.join(WEIGHTS), "half").unwrap();
+        let loaded = run.load().unwrap().unwrap();
+        assert_eq!((loaded.state, loaded.damaged.len()), (run.state(10), 0));
+        run.save(20);
+        assert_eq!(run.load().unwrap().unwrap().state, run.state(20));
+    }
+
+    #[test]
+    fn never_a_silent_fresh_start() {
+        let run = run();
+        for folder in [run.save(10), run.save(20)] {
+            fs::write(folder.join(SUMS), "").unwrap();
+        }
+        let message = run.load().unwrap_err().to_string();
+        assert!(message.contains("no checkpoint in") && message.contains("step-000000000020"), "{message}");
     }
 }

@@ -3,7 +3,7 @@
 use crate::{
     coordinator::{Control, Event},
     evaluation::{Evaluator, TaskResult},
-    trainer::evaluation_seed,
+    trainer::{Checkpointed, evaluation_seed},
     weights::WeightsBoard,
 };
 use rit_algo::{Acting, Rit};
@@ -66,12 +66,11 @@ impl control_server::Control for ControlService {
         &self,
         _: Request<v1::CheckpointRequest>,
     ) -> Result<Response<v1::CheckpointResponse>, Status> {
-        let written = self.ask(Control::Checkpoint).await?.map_err(Status::internal)?;
-        Ok(Response::new(v1::CheckpointResponse {
-            path: written.path.display().to_string(),
-            env_steps: written.progress.env_steps,
-            weights_digest: written.weights_digest,
-        }))
+        let Checkpointed { progress, weights_digest, written } = self.ask(Control::Checkpoint).await?;
+        let written = written.await.map_err(|_| Status::unavailable("the run is over"))?;
+        let path = written.map_err(|error| Status::internal(error.to_string()))?;
+        let (path, env_steps) = (path.display().to_string(), progress.env_steps);
+        Ok(Response::new(v1::CheckpointResponse { path, env_steps, weights_digest }))
     }
 
     async fn evaluate(

@@ -7,7 +7,7 @@ use crate::{
     evaluation::TaskResult,
     ledger::{ActorId, Lease, Ledger, Reason, Terms},
     receive::Fence,
-    trainer::{News, Standing, Work, Written},
+    trainer::{Beginning, Checkpointed, News, Standing, Work},
 };
 use rit_config::Config;
 use rit_episode::{Episode, wire};
@@ -22,6 +22,9 @@ use tonic::Status;
 
 /// How long the end of a run waits for actors to go.
 const FAREWELL_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// From one look for hung actors to the next.
+const LOOK_EVERY: Duration = Duration::from_millis(250);
 
 /// Messages an actor's stream may hold: far more than one lease at a time can fill.
 pub const ACTOR_QUEUE: usize = 64;
@@ -43,6 +46,8 @@ pub enum Event {
     Done(ActorId, u64),
     /// All that an actor had sent by `Done` has been read.
     Fenced(Fence),
+    /// An actor is there.
+    Heartbeat(ActorId),
     /// An actor wants to go.
     Leaving(ActorId),
     /// An actor's stream has ended.
@@ -65,7 +70,7 @@ pub enum Control {
     /// Leases again.
     Resume(oneshot::Sender<v1::RunStatus>),
     /// A checkpoint.
-    Checkpoint(oneshot::Sender<Result<Written, String>>),
+    Checkpoint(oneshot::Sender<Checkpointed>),
     /// The end of the run.
     Stop(oneshot::Sender<v1::RunStatus>),
 }
@@ -82,6 +87,10 @@ struct Actor {
     /// Leases it was given; the last one's number.
     leases: u64,
     leaving: bool,
+    /// When it last said anything.
+    heard: Instant,
+    /// Silent for too long: its episodes went to another.
+    hung: bool,
 }
 
 /// The coordinator.
@@ -100,16 +109,21 @@ pub struct Coordinator {
 }
 
 impl Coordinator {
-    /// A coordinator at the beginning of a run. `work` leads to the trainer, `fences` to the receiving thread.
-    pub fn new(config: Config, work: mpsc::Sender<Work>, fences: mpsc::Sender<Fence>) -> Self {
-        let first = Terms { weights_version: 0, epsilon: config.epsilon(0) };
+    /// A coordinator where a run begins. `work` leads to the trainer, `fences` to the receiving thread.
+    pub fn new(
+        config: Config,
+        beginning: Beginning,
+        work: mpsc::Sender<Work>,
+        fences: mpsc::Sender<Fence>,
+    ) -> Self {
+        let Beginning { batches, terms, standing } = beginning;
         Self {
-            ledger: Ledger::new(config.algorithm.n_rollout_threads, config.algorithm.policy_lag, first),
+            epsilon: config.epsilon(standing.progress.env_steps),
+            standing,
+            ledger: Ledger::new(config.algorithm.n_rollout_threads, batches, terms),
             actors: BTreeMap::new(),
             next_actor: 0,
             state: v1::RunState::Running,
-            standing: Standing::default(),
-            epsilon: first.epsilon,
             frames_refused: BTreeMap::new(),
             started: Instant::now(),
             config,
@@ -120,11 +134,15 @@ impl Coordinator {
 
     /// Works until the trainer is done and the actors have gone.
     pub async fn run(mut self, mut events: async_mpsc::Receiver<Event>) {
-        while let Some(event) = events.recv().await {
-            if matches!(event, Event::Over) {
-                break;
+        let mut looks = tokio::time::interval(LOOK_EVERY);
+        loop {
+            tokio::select! {
+                event = events.recv() => match event {
+                    None | Some(Event::Over) => break,
+                    Some(event) => self.handle(event),
+                },
+                _ = looks.tick() => self.look_for_hung_actors(),
             }
-            self.handle(event);
         }
         self.state = v1::RunState::Stopping;
         self.part_with_actors(&mut events).await;
@@ -150,6 +168,7 @@ impl Coordinator {
                 }
             }
             Event::Done(actor, lease) => {
+                self.heard(actor);
                 // Not all of it has come through yet, or a frame was refused: look again once all that was
                 // sent before has been read.
                 if self.has_outstanding(actor, lease) {
@@ -163,7 +182,9 @@ impl Coordinator {
                     self.hand_out();
                 }
             }
+            Event::Heartbeat(actor) => self.heard(actor),
             Event::Leaving(actor) => {
+                self.heard(actor);
                 if let Some(leaving) = self.actors.get_mut(&actor) {
                     leaving.leaving = true;
                 }
@@ -237,8 +258,45 @@ impl Coordinator {
         self.next_actor += 1;
         tracing::info!(name, pid, actor = id, "an actor joined");
         let capacity = capacity.clamp(1, 4096) as usize;
-        self.actors.insert(id, Actor { name, pid, capacity, to, episodes: 0, leases: 0, leaving: false });
+        self.actors.insert(
+            id,
+            Actor {
+                name,
+                pid,
+                capacity,
+                to,
+                episodes: 0,
+                leases: 0,
+                leaving: false,
+                heard: Instant::now(),
+                hung: false,
+            },
+        );
         Ok(id)
+    }
+
+    fn heard(&mut self, id: ActorId) {
+        let Some(actor) = self.actors.get_mut(&id) else { return };
+        actor.heard = Instant::now();
+        if std::mem::take(&mut actor.hung) {
+            tracing::info!(name = actor.name, actor = id, "an actor that hung is back");
+            self.hand_out();
+        }
+    }
+
+    fn look_for_hung_actors(&mut self) {
+        let timeout = Duration::from_millis(self.config.actors.heartbeat_timeout_ms);
+        let silent = |actor: &Actor| !actor.hung && actor.heard.elapsed() >= timeout;
+        let hung: Vec<ActorId> = self.actors.iter().filter(|(_, a)| silent(a)).map(|(&id, _)| id).collect();
+        for id in hung {
+            let had = self.ledger.take_back(id, Reason::ActorHung);
+            if let Some(actor) = self.actors.get_mut(&id) {
+                actor.hung = true;
+                let silent_s = actor.heard.elapsed().as_secs_f64();
+                tracing::warn!(name = actor.name, actor = id, had, silent_s, "an actor hangs");
+            }
+            self.hand_out();
+        }
     }
 
     fn gone(&mut self, id: ActorId) {
@@ -273,7 +331,7 @@ impl Coordinator {
         }
         let share = self.config.algorithm.n_rollout_threads.div_ceil(self.actors.len().max(1));
         let idle = |(id, actor): (&ActorId, &Actor)| {
-            let idle = !actor.leaving && self.ledger.outstanding_with(*id).next().is_none();
+            let idle = !actor.leaving && !actor.hung && self.ledger.outstanding_with(*id).next().is_none();
             idle.then_some((*id, actor.capacity.min(share)))
         };
         for (id, limit) in self.actors.iter().filter_map(idle).collect::<Vec<_>>() {
@@ -377,6 +435,8 @@ impl Coordinator {
             pid: actor.pid,
             episodes: actor.episodes,
             outstanding: self.ledger.outstanding_with(id).count() as u64,
+            silent_s: actor.heard.elapsed().as_secs_f64(),
+            hung: actor.hung,
         }
     }
 }

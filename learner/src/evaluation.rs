@@ -7,13 +7,13 @@ use rit_env::{
 };
 use rit_episode::{Policy, RunSeed};
 use rit_proto::v1;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// Episodes rolled side by side.
 const SIDE_BY_SIDE: usize = 32;
 
 /// What a policy reached on one task.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TaskResult {
     /// The task's name.
     #[serde(skip)]

@@ -8,13 +8,14 @@
 //! Nothing here waits, sends or draws: it is the bookkeeping alone.
 
 use rit_episode::Episode;
+use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 /// Names an actor for as long as it is there; never used again.
 pub type ActorId = u32;
 
 /// What a batch is rolled with.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Terms {
     /// Weights, counted in updates.
     pub weights_version: u64,
@@ -34,8 +35,10 @@ pub struct Lease {
 /// Why an outstanding episode will not be inserted by the actor that had it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Reason {
-    /// The actor died or was given up.
+    /// The actor died.
     ActorGone,
+    /// The actor gave no sign of life for too long.
+    ActorHung,
     /// The actor says it has sent it, and it is not there: its frame was refused.
     NotArrived,
     /// The run ended first.
@@ -47,6 +50,7 @@ impl Reason {
     pub fn name(self) -> &'static str {
         match self {
             Self::ActorGone => "actor_gone",
+            Self::ActorHung => "actor_hung",
             Self::NotArrived => "not_arrived",
             Self::RunEnded => "run_ended",
         }
@@ -106,22 +110,24 @@ pub struct Ledger {
 }
 
 impl Ledger {
-    /// A ledger at the beginning of a run: the first `policy_lag` + 1 batches are rolled on `first` terms.
+    /// A ledger of which so many batches are done; the next ones are rolled on `terms`, in order.
     ///
     /// # Panics
     /// When a batch has no episode.
-    pub fn new(episodes_per_batch: usize, policy_lag: usize, first: Terms) -> Self {
+    pub fn new(episodes_per_batch: usize, batches_done: u64, terms: Vec<Terms>) -> Self {
         assert!(episodes_per_batch > 0, "a batch has episodes");
+        let episodes_per_batch = episodes_per_batch as u64;
+        let done = batches_done * episodes_per_batch;
         Self {
-            episodes_per_batch: episodes_per_batch as u64,
-            terms: vec![first; policy_lag + 1].into(),
-            next_batch: 0,
-            next_number: 0,
+            episodes_per_batch,
+            terms: terms.into(),
+            next_batch: batches_done,
+            next_number: done,
             returned: BTreeSet::new(),
             outstanding: BTreeMap::new(),
             arrived: BTreeMap::new(),
-            handed_out: 0,
-            inserted: 0,
+            handed_out: done,
+            inserted: done,
             rejected: BTreeMap::new(),
         }
     }
@@ -250,7 +256,7 @@ mod tests {
 
     #[test]
     fn a_batch_waits_for_its_terms_and_for_all_its_episodes() {
-        let mut ledger = Ledger::new(2, 1, terms(0));
+        let mut ledger = Ledger::new(2, 0, vec![terms(0); 2]);
         let lease =
             |ledger: &mut Ledger, actor, limit| ledger.lease(actor, limit).map(|lease| lease.episodes);
         // Batches 0 and 1 are open: a lag of one.
@@ -272,7 +278,7 @@ mod tests {
 
     #[test]
     fn what_a_dead_actor_had_goes_to_another_first() {
-        let mut ledger = Ledger::new(4, 0, terms(7));
+        let mut ledger = Ledger::new(4, 0, vec![terms(7)]);
         ledger.lease(1, 3);
         ledger.insert(1, episode(1, 7)).unwrap();
         assert_eq!(ledger.take_back(1, Reason::ActorGone), 2);
@@ -287,8 +293,21 @@ mod tests {
     }
 
     #[test]
+    fn a_ledger_goes_on_behind_what_is_done() {
+        let mut ledger = Ledger::new(2, 5, vec![terms(4), terms(5)]);
+        assert_eq!(ledger.lease(1, 9), Some(Lease { episodes: vec![10, 11], terms: terms(4) }));
+        assert_eq!(ledger.lease(1, 9), Some(Lease { episodes: vec![12, 13], terms: terms(5) }));
+        assert_eq!(ledger.lease(1, 9), None);
+        assert!(ledger.insert(1, episode(9, 4)).is_err(), "done already");
+        ledger.insert(1, episode(11, 4)).unwrap();
+        ledger.insert(1, episode(10, 4)).unwrap();
+        assert_eq!(numbers(ledger.take_batch()), Some(vec![10, 11]));
+        assert!(ledger.counts().balance());
+    }
+
+    #[test]
     fn what_is_not_outstanding_is_refused() {
-        let mut ledger = Ledger::new(2, 0, terms(3));
+        let mut ledger = Ledger::new(2, 0, vec![terms(3)]);
         ledger.lease(1, 1);
         assert!(ledger.insert(2, episode(0, 3)).is_err(), "another actor's");
         assert!(ledger.insert(1, episode(0, 2)).is_err(), "other weights");
@@ -330,7 +349,7 @@ mod tests {
             lag in 0..3_usize,
             course in prop::collection::vec(happens(), 0..300),
         ) {
-            let mut ledger = Ledger::new(size, lag, terms(0));
+            let mut ledger = Ledger::new(size, 0, vec![terms(0); lag + 1]);
             let mut rolling: Vec<(ActorId, u64, u64)> = vec![];
             let (mut next, mut version) = (0, 0);
             for event in course {

@@ -1,7 +1,7 @@
 //! The learner: receives episodes, updates the weights, and serves whoever asks.
 //!
-//! Three threads and a runtime. [`receive`] reads shared memory; [`trainer`] owns replay and weights; on the
-//! runtime, [`coordinator`] owns the [`ledger`] and the gRPC services turn calls into its events.
+//! Four threads and a runtime. [`receive`] reads shared memory; [`trainer`] owns replay and weights; [`writer`]
+//! writes replay and checkpoints; [`update`](rit_algo::Update)'s threads work on batches. On the runtime, [`coordinator`] owns the [`ledger`] and the gRPC services turn calls into its events.
 
 pub mod checkpoint;
 pub mod control_service;
@@ -11,9 +11,12 @@ pub mod ledger;
 pub mod metrics;
 pub mod receive;
 pub mod replay;
+pub mod replay_log;
 pub mod rollout_service;
 mod run;
 pub mod trainer;
 pub mod weights;
+pub mod weights_file;
+pub mod writer;
 
 pub use run::{LearnerError, run};

@@ -7,7 +7,7 @@ use serde::Serialize;
 use std::{
     collections::{BTreeMap, VecDeque},
     fs::{File, OpenOptions},
-    io::{self, Write as _},
+    io::{self, Seek as _, SeekFrom, Write as _},
     path::Path,
     time::Instant,
 };
@@ -29,6 +29,18 @@ impl Recent {
     pub fn new(tasks: Vec<String>, has_wins: bool) -> Self {
         let episodes = tasks.iter().map(|_| VecDeque::with_capacity(RECENT)).collect();
         Self { tasks, has_wins, episodes }
+    }
+
+    /// What is counted: (return, won), the newest last, by task.
+    pub fn windows(&self) -> Vec<Vec<(f64, bool)>> {
+        self.episodes.iter().map(|recent| recent.iter().copied().collect()).collect()
+    }
+
+    /// Goes on with what was counted before.
+    pub fn restore(&mut self, windows: Vec<Vec<(f64, bool)>>) {
+        for (recent, window) in self.episodes.iter_mut().zip(windows) {
+            *recent = window.into();
+        }
     }
 
     /// Counts an episode.
@@ -115,30 +127,82 @@ impl From<Losses> for LossLine {
 #[derive(Debug)]
 pub struct MetricsFile {
     file: File,
+    len: u64,
     started: Instant,
+    /// Seconds that learners before this one ran.
+    before_s: f64,
 }
 
 impl MetricsFile {
-    /// Begins or continues the file.
+    /// Begins the file, or goes on behind its first `len` bytes: what lies behind them was written by a learner
+    /// that died, and will be written again. `before_s` are the seconds that learners ran before.
     ///
     /// # Errors
     /// When it cannot be written.
-    pub fn open(path: &Path) -> io::Result<Self> {
-        Ok(Self { file: OpenOptions::new().create(true).append(true).open(path)?, started: Instant::now() })
+    pub fn open(path: &Path, len: u64, before_s: f64) -> io::Result<Self> {
+        let mut file = OpenOptions::new().create(true).truncate(false).write(true).open(path)?;
+        file.set_len(len.min(file.metadata()?.len()))?;
+        let len = file.seek(SeekFrom::End(0))?;
+        Ok(Self { file, len, started: Instant::now(), before_s })
     }
 
-    /// Seconds since it was opened.
+    /// Seconds that learners have run, this one and those before.
     pub fn wall_s(&self) -> f64 {
-        self.started.elapsed().as_secs_f64()
+        self.before_s + self.started.elapsed().as_secs_f64()
     }
 
-    /// Writes a line at once, so that whoever follows the file sees it whole.
+    /// Bytes written.
+    pub fn len(&self) -> u64 {
+        self.len
+    }
+
+    /// Whether nothing is written yet.
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// Writes a line at once, so that whoever follows the file sees it whole. A failed write leaves the file as
+    /// it was.
     ///
     /// # Errors
     /// When the disk refuses.
     pub fn write(&mut self, line: &Line<'_>) -> io::Result<()> {
         let mut text = serde_json::to_vec(line)?;
         text.push(b'\n');
-        self.file.write_all(&text)
+        if let Err(error) = self.file.write_all(&text) {
+            self.file.set_len(self.len)?;
+            self.file.seek(SeekFrom::Start(self.len))?;
+            return Err(error);
+        }
+        self.len += text.len() as u64;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs;
+
+    #[test]
+    fn a_resumed_file_forgets_what_the_dead_learner_wrote_last() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let line = |env_steps| Line::Evaluation {
+            progress: Progress { env_steps, ..Progress::default() },
+            wall_s: 0.0,
+            tasks: BTreeMap::new(),
+        };
+        let mut first = MetricsFile::open(file.path(), 0, 0.0).unwrap();
+        first.write(&line(1)).unwrap();
+        let at_checkpoint = first.len();
+        first.write(&line(2)).unwrap();
+        let mut second = MetricsFile::open(file.path(), at_checkpoint, 100.0).unwrap();
+        second.write(&line(3)).unwrap();
+        assert!(second.wall_s() >= 100.0);
+        let text = fs::read_to_string(file.path()).unwrap();
+        let steps: Vec<_> =
+            text.lines().map(|line| line.contains("\"env_steps\":1") || line.contains(":3")).collect();
+        assert_eq!(steps, [true, true]);
+        assert_eq!(second.len(), text.len() as u64);
     }
 }

@@ -2,12 +2,12 @@
 
 use rand::seq::index;
 use rit_episode::{Episode, Rng};
-use std::collections::VecDeque;
+use std::{collections::VecDeque, sync::Arc};
 
-/// The last episodes, oldest first, real rows only.
+/// The last episodes, oldest first, real rows only. Whoever writes them to disk shares them.
 #[derive(Debug)]
 pub struct Replay {
-    episodes: VecDeque<Episode>,
+    episodes: VecDeque<Arc<Episode>>,
     capacity: usize,
 }
 
@@ -18,7 +18,7 @@ impl Replay {
     }
 
     /// Puts an episode behind the others; the oldest goes when there is no room.
-    pub fn insert(&mut self, episode: Episode) {
+    pub fn insert(&mut self, episode: Arc<Episode>) {
         if self.episodes.len() == self.capacity {
             self.episodes.pop_front();
         }
@@ -40,7 +40,7 @@ impl Replay {
     /// # Panics
     /// When it holds fewer.
     pub fn sample(&self, count: usize, rng: &mut Rng) -> Vec<&Episode> {
-        index::sample(rng, self.len(), count).iter().map(|index| &self.episodes[index]).collect()
+        index::sample(rng, self.len(), count).iter().map(|index| &*self.episodes[index]).collect()
     }
 }
 
@@ -72,7 +72,7 @@ mod tests {
     fn keeps_the_last_and_samples_them_evenly() {
         let mut replay = Replay::new(5);
         for number in 0..8 {
-            replay.insert(episode(number));
+            replay.insert(Arc::new(episode(number)));
         }
         let mut counts = [0; 8];
         for update in 0..2000 {

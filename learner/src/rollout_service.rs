@@ -36,7 +36,8 @@ impl rollout_server::Rollout for RolloutService {
                 let event = match message.message {
                     Some(Message::Done(done)) => Event::Done(actor, done.lease),
                     Some(Message::Leaving(_)) => Event::Leaving(actor),
-                    Some(Message::Hello(_) | Message::Heartbeat(_)) | None => continue,
+                    Some(Message::Heartbeat(_)) => Event::Heartbeat(actor),
+                    Some(Message::Hello(_)) | None => continue,
                 };
                 if events.send(event).await.is_err() {
                     return;

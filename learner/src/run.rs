@@ -1,12 +1,15 @@
 //! A learner process from its beginning to its end.
 
 use crate::{
+    checkpoint::{self, CheckpointError, Loaded},
     control_service::ControlService,
     coordinator::{Coordinator, Event},
     receive::receive,
+    replay_log::{ReplayLog, ReplayLogError},
     rollout_service::RolloutService,
     trainer::{Summary, TrainError, Trainer},
     weights::WeightsService,
+    writer::Writer,
 };
 use rit_algo::{ConfigError, Rit};
 use rit_config::{Config, RunDir};
@@ -59,6 +62,12 @@ pub enum LearnerError {
     /// The configuration makes no model.
     #[error(transparent)]
     Model(#[from] ConfigError),
+    /// There are checkpoints and none can be used.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    /// Replay on disk cannot be continued.
+    #[error(transparent)]
+    Replay(#[from] ReplayLogError),
     /// Training failed.
     #[error(transparent)]
     Train(#[from] TrainError),
@@ -109,8 +118,19 @@ pub async fn run(
     let news = Box::new(move |what| {
         let _ = news.blocking_send(Event::News(what));
     });
-    let (trainer, board) = Trainer::new(config.clone(), run_dir.clone(), Arc::clone(&rit), news)?;
-    let coordinator = Coordinator::new(config.clone(), work, fences);
+    let loaded = load(&run_dir, &rit, &expected, config.algorithm.buffer_size)?;
+    let episodes = loaded.as_ref().map_or(0, |loaded| loaded.state.manifest.progress.episodes);
+    let writer = Writer {
+        run_dir: run_dir.clone(),
+        rit: Arc::clone(&rit),
+        log: ReplayLog::open(&run_dir.replay(), expected.layout, run_dir.run_id(), episodes)?,
+        buffer_size: config.algorithm.buffer_size,
+        keep: config.checkpoints.keep,
+    };
+    let (to_write, write_queue) = mpsc::channel();
+    let (trainer, board) =
+        Trainer::new(config.clone(), run_dir.clone(), Arc::clone(&rit), loaded, news, to_write)?;
+    let coordinator = Coordinator::new(config.clone(), trainer.beginning(), work, fences);
 
     let stop = Arc::new(AtomicBool::new(false));
     let receiving = {
@@ -121,6 +141,7 @@ pub async fn run(
             result
         })?
     };
+    let writing = spawn("write", move || writer.run(&write_queue))?;
     let training = {
         let events = events.clone();
         spawn("train", move || {
@@ -174,7 +195,27 @@ pub async fn run(
     if let Err(error) = space.remove() {
         tracing::warn!(%error, "something of the run is still in shared memory");
     }
-    Ok(training.await.map_err(|_| LearnerError::Panicked("train"))??)
+    let result = training.await.map_err(|_| LearnerError::Panicked("train"))?;
+    writing.await.map_err(|_| LearnerError::Panicked("write"))?;
+    Ok(result?)
+}
+
+/// The newest checkpoint that can be used, if any was ever written.
+fn load(
+    run_dir: &RunDir,
+    rit: &Rit,
+    expected: &Expected,
+    buffer_size: usize,
+) -> Result<Option<Loaded>, LearnerError> {
+    let loaded = checkpoint::load_newest(run_dir, rit, expected, buffer_size)?;
+    if let Some(Loaded { folder, state, damaged, .. }) = &loaded {
+        for error in damaged {
+            tracing::error!(%error, "a checkpoint is damaged; the one before is used");
+        }
+        let (folder, env_steps) = (folder.display(), state.manifest.progress.env_steps);
+        tracing::info!(%folder, env_steps, "going on from a checkpoint");
+    }
+    Ok(loaded)
 }
 
 /// A named thread, and the way to its result.

@@ -2,12 +2,14 @@
 //! weights; nothing it does depends on time.
 
 use crate::{
-    checkpoint::{self, CheckpointError, Progress},
+    checkpoint::{Loaded, Manifest, Progress, SnapshotMark, TrainingState},
     evaluation::{Evaluator, TaskResult},
     ledger::Terms,
     metrics::{Line, MetricsFile, Recent, by_task},
     replay::Replay,
     weights::{Snapshot, WeightsBoard},
+    weights_file,
+    writer::{ToWrite, Written},
 };
 use rit_algo::{Acting, Losses, Rit, Update};
 use rit_config::{Config, RunDir, Until};
@@ -15,7 +17,7 @@ use rit_env::Split;
 use rit_episode::{Episode, RunSeed, Stream};
 use serde::Serialize;
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, VecDeque},
     fs, io,
     path::PathBuf,
     sync::{Arc, mpsc},
@@ -28,20 +30,20 @@ pub enum Work {
     /// The next batch in order of number.
     Batch(Vec<Episode>),
     /// Write a checkpoint now.
-    Checkpoint(oneshot::Sender<Result<Written, String>>),
+    Checkpoint(oneshot::Sender<Checkpointed>),
     /// End the run.
     Stop,
 }
 
 /// A checkpoint that was asked for.
 #[derive(Debug)]
-pub struct Written {
-    /// Relative to the run directory.
-    pub path: PathBuf,
+pub struct Checkpointed {
     /// How far training had come.
     pub progress: Progress,
     /// Digest of the weights.
     pub weights_digest: String,
+    /// Comes when it is on disk.
+    pub written: oneshot::Receiver<Written>,
 }
 
 /// How training stands: what status answers are made of.
@@ -85,10 +87,10 @@ pub struct Summary {
 /// Why training ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
-    /// A checkpoint could not be written.
-    #[error(transparent)]
-    Checkpoint(#[from] CheckpointError),
-    /// Another file of the run directory could not be written.
+    /// The last checkpoint could not be written.
+    #[error("the last checkpoint was not written: {0}; `rit train --resume` goes on from the one before")]
+    Checkpoint(String),
+    /// A file of the run directory could not be written.
     #[error("{path}: {error}")]
     Io {
         /// The file.
@@ -116,13 +118,30 @@ pub struct Trainer {
     metrics: MetricsFile,
     recent: Recent,
     standing: Standing,
+    /// What the next batches are rolled with, in order.
+    terms: VecDeque<Terms>,
     /// Collected episodes when the target network was last copied.
     target_copied_at: u64,
+    /// Environment steps before the last batch.
+    env_steps_before: u64,
     news: Box<dyn FnMut(News) + Send>,
+    writer: mpsc::Sender<ToWrite>,
+}
+
+/// Where a run begins: what the rest of the learner needs to know of it.
+#[derive(Clone, Debug)]
+pub struct Beginning {
+    /// Batches done.
+    pub batches: u64,
+    /// What the next ones are rolled with, in order.
+    pub terms: Vec<Terms>,
+    /// How training stands.
+    pub standing: Standing,
 }
 
 impl Trainer {
-    /// A trainer at the beginning of a run, and the board it publishes its weights on. `news` must not wait.
+    /// A trainer at the beginning of a run or where a checkpoint was written, and the board it publishes its
+    /// weights on. `news` must not wait.
     ///
     /// # Errors
     /// When the metrics file or the update's threads cannot be had.
@@ -130,32 +149,83 @@ impl Trainer {
         config: Config,
         run_dir: RunDir,
         rit: Arc<Rit>,
+        loaded: Option<Loaded>,
         news: Box<dyn FnMut(News) + Send>,
+        writer: mpsc::Sender<ToWrite>,
     ) -> Result<(Self, Arc<WeightsBoard>), TrainError> {
         let params = rit.layout.initial(&mut config.seed.stream(Stream::Weights, 0));
         let update = Update::new(Arc::clone(&rit), config.update(), params)
             .map_err(|error| TrainError::Threads(error.to_string()))?;
-        let path = run_dir.metrics();
-        let metrics = MetricsFile::open(&path).map_err(|error| TrainError::Io { path, error })?;
+        let lag = config.algorithm.policy_lag;
         let first = Snapshot::new(0, 0, &update.params[rit.acting()]);
-        let board = Arc::new(WeightsBoard::new(first, config.algorithm.policy_lag));
+        let first_terms = Terms { weights_version: 0, epsilon: config.epsilon(0) };
         let task_set = config.environment.task_set;
         let tasks = task_set.tasks(Split::Training).iter().map(ToString::to_string).collect();
-        let trainer = Self {
+        let (metrics_len, wall_s) = loaded
+            .as_ref()
+            .map_or((0, 0.0), |loaded| (loaded.state.manifest.metrics_len, loaded.state.manifest.wall_s));
+        let path = run_dir.metrics();
+        let metrics =
+            MetricsFile::open(&path, metrics_len, wall_s).map_err(|error| TrainError::Io { path, error })?;
+        let mut trainer = Self {
             replay: Replay::new(config.algorithm.buffer_size),
-            board: Arc::clone(&board),
+            board: Arc::new(WeightsBoard::new(first, lag)),
             evaluator: Evaluator::new(&config),
             metrics,
             recent: Recent::new(tasks, task_set.has_wins()),
             standing: Standing::default(),
+            terms: vec![first_terms; lag + 1].into(),
             target_copied_at: 0,
+            env_steps_before: 0,
             news,
+            writer,
             rit,
             update,
             run_dir,
             config,
         };
+        if let Some(loaded) = loaded {
+            trainer.go_on_from(loaded);
+        }
+        let board = Arc::clone(&trainer.board);
         Ok((trainer, board))
+    }
+
+    /// Where the run begins.
+    pub fn beginning(&self) -> Beginning {
+        Beginning {
+            batches: self.standing.progress.episodes / self.config.algorithm.n_rollout_threads as u64,
+            terms: self.terms.iter().copied().collect(),
+            standing: self.standing.clone(),
+        }
+    }
+
+    fn go_on_from(&mut self, loaded: Loaded) {
+        let TrainingState { params, target, mean, mean_square, snapshots, manifest } = loaded.state;
+        self.update.params = params;
+        self.update.target = target;
+        self.update.optimizer.mean = mean;
+        self.update.optimizer.mean_square = mean_square;
+        self.update.optimizer.steps = manifest.progress.updates;
+        self.target_copied_at = manifest.target_copied_at;
+        self.terms = manifest.terms.into();
+        let mut snapshots = snapshots.into_iter();
+        if let Some(oldest) = snapshots.next() {
+            self.board = Arc::new(WeightsBoard::new(oldest, self.config.algorithm.policy_lag));
+        }
+        snapshots.for_each(|snapshot| self.board.publish(snapshot));
+        self.recent.restore(manifest.recent);
+        loaded.replay.into_iter().for_each(|episode| self.replay.insert(Arc::new(episode)));
+        let named = |(task, result): (String, TaskResult)| TaskResult { task, ..result };
+        self.standing = Standing {
+            progress: manifest.progress,
+            losses: Losses::default(),
+            recent: self.recent.results(),
+            evaluation: manifest
+                .evaluation
+                .map(|(at, results)| (at, results.into_iter().map(named).collect())),
+            replay_episodes: self.replay.len(),
+        };
     }
 
     /// Works until the run is over or nobody can ask any more, then writes checkpoint and summary.
@@ -163,24 +233,32 @@ impl Trainer {
     /// # Errors
     /// When a file cannot be written or the weights diverge.
     pub fn run(mut self, work: &mpsc::Receiver<Work>) -> Result<Summary, TrainError> {
-        self.evaluate()?;
-        while let Ok(work) = work.recv() {
+        if self.standing.evaluation.is_none() {
+            self.evaluate()?;
+        }
+        let mut over = self.standing.progress.env_steps >= self.config.training.t_max;
+        while !over && let Ok(work) = work.recv() {
             match work {
                 Work::Batch(episodes) => {
-                    let over = self.train(episodes)?;
+                    over = self.train(episodes)?;
+                    // The terms of the batch that `policy_lag` leaves to be opened next.
                     let terms = Terms {
                         weights_version: self.standing.progress.updates,
                         epsilon: self.config.epsilon(self.standing.progress.env_steps),
                     };
+                    self.terms.pop_front();
+                    self.terms.push_back(terms);
                     (self.news)(News::Trained(terms, self.standing.clone()));
-                    if over {
-                        break;
+                    if self.is_due(self.config.checkpoints.every_env_steps) && !over {
+                        self.checkpoint(None);
                     }
                 }
                 Work::Checkpoint(answer) => {
-                    let written = self.checkpoint().map_err(|error| error.to_string());
+                    let (done, written) = oneshot::channel();
+                    let weights_digest = self.checkpoint(Some(done));
+                    let progress = self.standing.progress;
                     // Whoever asked may have gone.
-                    let _ = answer.send(written);
+                    let _ = answer.send(Checkpointed { progress, weights_digest, written });
                 }
                 Work::Stop => break,
             }
@@ -192,12 +270,15 @@ impl Trainer {
     /// One batch: into replay, one update, and whatever is due. Returns whether the run is over.
     fn train(&mut self, episodes: Vec<Episode>) -> Result<bool, TrainError> {
         let algorithm = &self.config.algorithm;
-        let before = self.standing.progress;
         let progress = &mut self.standing.progress;
+        self.env_steps_before = progress.env_steps;
         for episode in episodes {
             progress.env_steps += episode.steps() as u64;
             progress.episodes += 1;
             self.recent.push(&episode);
+            let episode = Arc::new(episode);
+            // Without a writer there is nobody to write; checkpoints say so.
+            let _ = self.writer.send(ToWrite::Episode(Arc::clone(&episode)));
             self.replay.insert(episode);
         }
         if self.replay.len() >= algorithm.batch_size {
@@ -220,8 +301,7 @@ impl Trainer {
         let after = *progress;
         self.standing.replay_episodes = self.replay.len();
         self.standing.recent = self.recent.results();
-        let due = |every: u64| after.env_steps / every > before.env_steps / every;
-        if due(self.config.learner.metrics_every_env_steps) {
+        if self.is_due(self.config.learner.metrics_every_env_steps) {
             let standing = &self.standing;
             let line = Line::Training {
                 progress: after,
@@ -235,7 +315,7 @@ impl Trainer {
                 .map_err(|error| TrainError::Io { path: self.run_dir.metrics(), error })?;
         }
         let mut over = after.env_steps >= self.config.training.t_max;
-        if due(self.config.evaluation.every_env_steps) {
+        if self.is_due(self.config.evaluation.every_env_steps) {
             let results = self.evaluate()?;
             over |= self.reached(&results);
         }
@@ -268,19 +348,54 @@ impl Trainer {
         }
     }
 
-    fn checkpoint(&self) -> Result<Written, CheckpointError> {
-        let progress = self.standing.progress;
-        let path = checkpoint::save(&self.run_dir, &self.rit, &self.update.params, progress)?;
-        let weights_digest = checkpoint::digest(&self.update.params);
-        tracing::info!(path = %path.display(), env_steps = progress.env_steps, "wrote a checkpoint");
-        Ok(Written { path, progress, weights_digest })
+    /// Whether the last batch passed a multiple of so many environment steps.
+    fn is_due(&self, every: u64) -> bool {
+        self.standing.progress.env_steps / every > self.env_steps_before / every
+    }
+
+    /// Hands a copy of everything to the writer. Returns the weights' digest.
+    fn checkpoint(&self, done: Option<oneshot::Sender<Written>>) -> String {
+        let weights_digest = weights_file::digest(&self.update.params);
+        let kept = self.board.all_kept();
+        let mark = |snapshot: &Arc<Snapshot>| SnapshotMark {
+            version: snapshot.version,
+            env_steps: snapshot.env_steps,
+        };
+        let evaluation = self.standing.evaluation.as_ref().map(|(at, results)| {
+            (*at, results.iter().map(|result| (result.task.clone(), result.clone())).collect())
+        });
+        let state = TrainingState {
+            params: self.update.params.clone(),
+            target: self.update.target.clone(),
+            mean: self.update.optimizer.mean.clone(),
+            mean_square: self.update.optimizer.mean_square.clone(),
+            manifest: Manifest {
+                progress: self.standing.progress,
+                target_copied_at: self.target_copied_at,
+                terms: self.terms.iter().copied().collect(),
+                snapshots: kept.iter().map(mark).collect(),
+                recent: self.recent.windows(),
+                metrics_len: self.metrics.len(),
+                wall_s: self.metrics.wall_s(),
+                evaluation,
+                weights_digest: weights_digest.clone(),
+            },
+            snapshots: kept.iter().map(|snapshot| Snapshot::clone(snapshot)).collect(),
+        };
+        // A writer that has gone drops `done`, which tells whoever waits.
+        let _ = self.writer.send(ToWrite::Checkpoint(Box::new(state), done));
+        weights_digest
     }
 
     fn finish(self) -> Result<Summary, TrainError> {
-        let Written { progress, weights_digest, .. } = self.checkpoint()?;
+        let (done, written) = oneshot::channel();
+        let weights_digest = self.checkpoint(Some(done));
         let results = self.greedy(self.config.evaluation.episodes);
+        let written =
+            written.blocking_recv().map_err(|_| TrainError::Checkpoint("the writer has gone".into()))?;
+        written.map_err(|error| TrainError::Checkpoint(error.to_string()))?;
         let summary = Summary {
-            progress,
+            progress: self.standing.progress,
             wall_s: self.metrics.wall_s(),
             weights_digest,
             evaluation: results.into_iter().map(|result| (result.task.clone(), result)).collect(),

@@ -48,12 +48,17 @@ pub struct WeightsBoard {
 }
 
 impl WeightsBoard {
-    /// A board with its first snapshot. The oldest version that a lease can ask for is `policy_lag` updates
+    /// A board with its newest snapshot. The oldest version that a lease can ask for is `policy_lag` updates
     /// behind the newest.
-    pub fn new(first: Snapshot, policy_lag: usize) -> Self {
-        let first = Arc::new(first);
-        let kept = Mutex::new(VecDeque::from([Arc::clone(&first)]));
-        Self { newest: watch::Sender::new(first), kept, keep: policy_lag + 1 }
+    pub fn new(newest: Snapshot, policy_lag: usize) -> Self {
+        let newest = Arc::new(newest);
+        let kept = Mutex::new(VecDeque::from([Arc::clone(&newest)]));
+        Self { newest: watch::Sender::new(newest), kept, keep: policy_lag + 1 }
+    }
+
+    /// All that leases can ask for, oldest first.
+    pub fn all_kept(&self) -> Vec<Arc<Snapshot>> {
+        self.kept().iter().map(Arc::clone).collect()
     }
 
     /// Puts up a newer snapshot.

@@ -17,6 +17,7 @@ pub struct Config {
     pub network: Network,
     pub training: Training,
     pub evaluation: Evaluation,
+    pub checkpoints: Checkpoints,
     pub actors: Actors,
     pub learner: Learner,
 }
@@ -147,6 +148,15 @@ pub struct Evaluation {
     pub testing_episodes: usize,
 }
 
+/// `[checkpoints]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs, reason = "presets/all.toml documents every key, for users too")]
+pub struct Checkpoints {
+    pub every_env_steps: u64,
+    pub keep: usize,
+}
+
 /// `[actors]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -154,6 +164,7 @@ pub struct Evaluation {
 pub struct Actors {
     pub count: usize,
     pub episodes_at_once: usize,
+    pub heartbeat_timeout_ms: u64,
 }
 
 /// `[learner]`.
@@ -258,8 +269,11 @@ impl Config {
             ("evaluation.every_env_steps", evaluation.every_env_steps as f64, 1.0, STEPS),
             ("evaluation.episodes", evaluation.episodes as f64, 1.0, COUNT),
             ("evaluation.testing_episodes", evaluation.testing_episodes as f64, 1.0, COUNT),
+            ("checkpoints.every_env_steps", self.checkpoints.every_env_steps as f64, 1.0, STEPS),
+            ("checkpoints.keep", self.checkpoints.keep as f64, 1.0, COUNT),
             ("actors.count", self.actors.count as f64, 0.0, 256.0),
             ("actors.episodes_at_once", self.actors.episodes_at_once as f64, 1.0, 4096.0),
+            ("actors.heartbeat_timeout_ms", self.actors.heartbeat_timeout_ms as f64, 2000.0, 3_600_000.0),
             ("learner.shards", self.learner.shards as f64, 1.0, 256.0),
             ("learner.threads", self.learner.threads as f64, 1.0, 256.0),
             ("learner.metrics_every_env_steps", self.learner.metrics_every_env_steps as f64, 1.0, STEPS),

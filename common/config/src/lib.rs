@@ -9,8 +9,8 @@ mod resolve;
 mod run_dir;
 
 pub use config::{
-    Actors, Algorithm, Config, Environment, Evaluation, Learner, MixingKind, Network, OptimizerName,
-    Training, Until,
+    Actors, Algorithm, Checkpoints, Config, Environment, Evaluation, Learner, MixingKind, Network,
+    OptimizerName, Training, Until,
 };
 pub use resolve::{ConfigError, resolve, set};
 pub use run_dir::{RunDir, RunDirError};

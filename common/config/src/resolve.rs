@@ -2,6 +2,7 @@
 
 use crate::Config;
 use rit_env::{TaskSet, UnknownName};
+use std::collections::BTreeMap;
 use toml::{Table, Value};
 
 /// What is wrong with what was typed. Every message names the key and what would do.
@@ -53,6 +54,12 @@ pub enum ConfigError {
     NoTaskSet {
         /// Those there are.
         known: String,
+    },
+    /// A key that a run under way cannot change.
+    #[error("{key} cannot change in a run that has begun; start a new one")]
+    Fixed {
+        /// The key.
+        key: String,
     },
     /// Values that cannot go together.
     #[error("{0}")]
@@ -107,6 +114,48 @@ pub fn set(assignment: &str) -> Result<Table, ConfigError> {
     let (key, value) = (key.trim(), value.trim());
     parse(&format!("{key} = {value}"), &source_name())
         .or_else(|_| parse(&format!("{key} = {value:?}"), &source_name()))
+}
+
+/// Keys, or sections, that a run may change when it goes on: no weight follows from them.
+const FREE: [&str; 8] = [
+    "training",
+    "evaluation",
+    "checkpoints",
+    "actors",
+    "learner.listen",
+    "learner.threads",
+    "learner.metrics_every_env_steps",
+    "learner.web",
+];
+
+/// Whether a run of the one configuration may go on as one of the other.
+///
+/// # Errors
+/// The first key that differs and may not.
+pub(crate) fn may_go_on(old: &Config, new: &Config) -> Result<(), ConfigError> {
+    let table =
+        |config: &Config| Table::try_from(config).map_err(|error| ConfigError::Value(error.to_string()));
+    let (old, new) = (table(old)?, table(new)?);
+    let keys = |table: &Table| {
+        let mut keys = BTreeMap::new();
+        for (section, value) in table {
+            match value {
+                Value::Table(section_table) => {
+                    keys.extend(
+                        section_table.iter().map(|(key, value)| (format!("{section}.{key}"), value.clone())),
+                    );
+                }
+                value => {
+                    keys.insert(section.clone(), value.clone());
+                }
+            }
+        }
+        keys
+    };
+    let (old, new) = (keys(&old), keys(&new));
+    let free = |key: &str| FREE.iter().any(|free| key == *free || key.starts_with(&format!("{free}.")));
+    let fixed = old.iter().find(|(key, value)| new.get(*key) != Some(value) && !free(key));
+    fixed.map_or(Ok(()), |(key, _)| Err(ConfigError::Fixed { key: key.clone() }))
 }
 
 fn parse(text: &str, source_name: &str) -> Result<Table, ConfigError> {

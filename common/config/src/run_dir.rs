@@ -1,6 +1,6 @@
 //! The run directory: where everything of one run lies, and under which names.
 
-use crate::{Config, ConfigError, resolve};
+use crate::{Config, ConfigError, resolve, resolve::may_go_on};
 use rit_episode::wire::RunId;
 use std::{
     fs::{self, DirBuilder, OpenOptions, Permissions},
@@ -124,6 +124,27 @@ impl RunDir {
         Ok((Self { root, run_id, token }, config))
     }
 
+    /// Opens a run's directory to go on with other settings, and writes the new configuration down.
+    ///
+    /// # Errors
+    /// When it holds no run, or a setting would change the result of what has been trained already.
+    pub fn resume(root: &Path, settings: &[toml::Table]) -> Result<(Self, Config), RunDirError> {
+        let (run_dir, old) = Self::open(root)?;
+        let path = run_dir.config_path();
+        let io = |error| RunDirError::Io { path: path.clone(), error };
+        let text = fs::read_to_string(&path).map_err(io)?;
+        let wrong = |error| RunDirError::Config { path: path.clone(), error };
+        let new = resolve(&text, "config.toml", settings).map_err(wrong)?;
+        may_go_on(&old, &new).map_err(wrong)?;
+        if new != old {
+            let partial = path.with_extension("partial");
+            fs::write(&partial, toml::to_string(&new)?)
+                .and_then(|()| fs::rename(&partial, &path))
+                .map_err(io)?;
+        }
+        Ok((run_dir, new))
+    }
+
     /// The directory itself, absolute.
     pub fn root(&self) -> &Path {
         &self.root
@@ -167,6 +188,11 @@ impl RunDir {
     /// One folder a checkpoint, and `latest`.
     pub fn checkpoints(&self) -> PathBuf {
         self.root.join("checkpoints")
+    }
+
+    /// The episodes that replay holds, and those that checkpoints still need.
+    pub fn replay(&self) -> PathBuf {
+        self.root.join("replay")
     }
 
     /// One file a process.
@@ -222,6 +248,24 @@ mod tests {
         assert!(matches!(RunDir::create(&root, &config()), Err(RunDirError::Occupied(_))));
         let other = RunDir::create(&folder.path().join("c"), &config()).unwrap();
         assert_ne!((made.run_id(), made.token()), (other.run_id(), other.token()));
+    }
+
+    #[test]
+    fn a_run_goes_on_with_other_settings_unless_they_change_the_result() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path().join("run");
+        RunDir::create(&root, &config()).unwrap();
+        let set = |text: &str| [crate::set(text).unwrap()];
+        let (_, longer) = RunDir::resume(&root, &set("training.t_max=70000")).unwrap();
+        assert_eq!(longer.training.t_max, 70_000);
+        let (_, more) = RunDir::resume(&root, &set("actors.count=5")).unwrap();
+        assert_eq!((more.training.t_max, more.actors.count), (70_000, 5), "what was set stays set");
+        for setting in ["algorithm.gamma=0.5", "seed=6", "learner.shards=3", "network.hidden_dim=8"] {
+            let error = RunDir::resume(&root, &set(setting)).unwrap_err().to_string();
+            let key = setting.split('=').next().unwrap();
+            assert!(error.contains(key) && error.contains("cannot change"), "{error}");
+        }
+        assert_eq!(RunDir::open(&root).unwrap().1, more);
     }
 
     #[test]

@@ -25,7 +25,7 @@ pub(super) fn run(config: &Config, duration: Duration) -> Result<Report, Failure
     let mut episode_bytes = 0;
     for episode in random_episodes(config, config.algorithm.buffer_size as u64) {
         episode_bytes += episode.bytes();
-        replay.insert(episode);
+        replay.insert(Arc::new(episode));
     }
 
     let mut number = 0;

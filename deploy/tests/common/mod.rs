@@ -83,14 +83,25 @@ impl Train {
                     return status;
                 }
             }
-            let over = self.child.as_mut().and_then(|child| child.try_wait().unwrap());
-            assert!(over.is_none() && begun.elapsed() < DEADLINE, "waiting for {what}: {over:?}");
+            if self.child.as_mut().unwrap().try_wait().unwrap().is_some() || begun.elapsed() > DEADLINE {
+                let _ = self.child.as_mut().unwrap().kill();
+                let output = self.child.take().unwrap().wait_with_output().unwrap();
+                panic!("waiting for {what}: {:?} {}", output.status, String::from_utf8_lossy(&output.stderr));
+            }
         }
     }
 
     /// Sends a signal to `rit train` itself.
     pub fn signal(&self, signal: Signal) {
         kill(self.child.as_ref().unwrap().id(), signal);
+    }
+
+    /// Trains on from where the run of this folder stands.
+    pub fn resume(folder: &RunFolder, arguments: &[&str]) -> Self {
+        let run_dir = folder.run_dir();
+        let mut command = rit(&["train", "--json", "--resume", run_dir.to_str().unwrap()]);
+        let child = command.args(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        Self { child: Some(child), run_dir }
     }
 
     /// Waits for the end.
@@ -128,6 +139,17 @@ pub fn wait_until_gone(pid: u32) {
         assert!(begun.elapsed() < DEADLINE, "process {pid} stays");
         std::thread::yield_now();
     }
+}
+
+/// The process of the actor of this name, if it is there.
+pub fn actor_pid(status: &Value, name: &str) -> Option<u32> {
+    let actors = status["actors"].as_array().unwrap();
+    actors.iter().find(|actor| actor["name"] == name).map(|actor| actor["pid"].as_u64().unwrap() as u32)
+}
+
+/// The process of the learner.
+pub fn learner_pid(status: &Value) -> u32 {
+    status["pid"].as_u64().unwrap() as u32
 }
 
 /// The processes of a run, as its status names them: the learner first.

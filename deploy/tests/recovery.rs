@@ -1,0 +1,182 @@
+//! Whatever is killed, stopped or interrupted: the run goes on, and ends with the weights of an undisturbed one.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "helpers of tests are tests too")]
+
+mod common;
+
+use common::{
+    RunFolder, Train, actor_pid, json_lines, kill, learner_pid, pids, shared_memory_of, wait_until_gone,
+};
+use rustix::process::Signal;
+use serde_json::Value;
+use std::{fs, sync::LazyLock};
+
+/// 400 episodes; replay of 100, so that checkpoints in the middle have to bring back part of it.
+const RUN: &[&str] = &[
+    "matrix-game",
+    "--seed",
+    "3",
+    "--steps",
+    "800",
+    "--set",
+    "algorithm.buffer_size=100",
+    "--set",
+    "checkpoints.every_env_steps=60",
+    "--set",
+    "evaluation.every_env_steps=200",
+    "--set",
+    "algorithm.target_update_interval=30",
+];
+
+/// The summary of a run that nothing happens to, and the lines of its metrics but for their times.
+static UNDISTURBED: LazyLock<(Value, Vec<Value>)> = LazyLock::new(|| {
+    let folder = RunFolder::new();
+    let summary = folder.train(&[RUN, &["--actors", "1"]].concat());
+    let lines = metrics(&folder);
+    (summary, lines)
+});
+
+fn metrics(folder: &RunFolder) -> Vec<Value> {
+    let mut lines = json_lines(&folder.run_dir().join("metrics.jsonl"));
+    for line in &mut lines {
+        line.as_object_mut().unwrap().remove("wall_s");
+    }
+    lines
+}
+
+/// Holds the end of a run to the undisturbed one: weights, evaluation, episodes and every line of the metrics.
+#[track_caller]
+fn nothing_was_lost(folder: &RunFolder, summary: &Value) {
+    let (undisturbed, lines) = &*UNDISTURBED;
+    for key in ["weights_digest", "env_steps", "episodes", "updates", "evaluation"] {
+        assert_eq!(summary[key], undisturbed[key], "{key}");
+    }
+    for (line, expected) in metrics(folder).iter().zip(lines) {
+        assert_eq!(line, expected);
+    }
+    assert_eq!(metrics(folder).len(), lines.len());
+    assert!(shared_memory_of(&folder.run_dir()).is_empty());
+}
+
+#[test]
+fn a_killed_actor_is_restarted() {
+    let folder = RunFolder::new();
+    let mut train = folder.start(&[RUN, &["--actors", "2"]].concat());
+    for name in ["actor-0", "actor-1"] {
+        let status = train.wait_for(name, |status| actor_pid(status, name).is_some());
+        let victim = actor_pid(&status, name).unwrap();
+        kill(victim, Signal::KILL);
+        train.wait_for("its successor", |status| actor_pid(status, name).is_some_and(|pid| pid != victim));
+    }
+    nothing_was_lost(&folder, &train.finish());
+}
+
+#[test]
+fn a_killed_learner_is_restarted_from_its_newest_checkpoint_and_actors_find_it() {
+    let folder = RunFolder::new();
+    let mut train = folder.start(&[RUN, &["--actors", "2"]].concat());
+    let mut actors = None;
+    // Before the first checkpoint, and behind others.
+    for env_steps in [20, 200, 500] {
+        let status = train.wait_for("progress", |status| status["env_steps"].as_u64() >= Some(env_steps));
+        kill(learner_pid(&status), Signal::KILL);
+        let killed = learner_pid(&status);
+        let after = train.wait_for("its successor and both actors", |status| {
+            learner_pid(status) != killed && status["actors"].as_array().unwrap().len() == 2
+        });
+        let mut survivors = pids(&after)[1..].to_vec();
+        survivors.sort_unstable();
+        assert_eq!(*actors.get_or_insert_with(|| survivors.clone()), survivors, "the actors lived on");
+    }
+    nothing_was_lost(&folder, &train.finish());
+}
+
+#[test]
+fn a_hung_actor_is_noticed_and_replaced() {
+    let folder = RunFolder::new();
+    let heartbeat = ["--actors", "2", "--set", "actors.heartbeat_timeout_ms=2000", "--steps", "800"];
+    let mut train = folder.start(&[RUN, &heartbeat].concat());
+    let status = train.wait_for("actor-0", |status| actor_pid(status, "actor-0").is_some());
+    let victim = actor_pid(&status, "actor-0").unwrap();
+    kill(victim, Signal::STOP);
+    // Its episodes go to the other, so the run may end before it is replaced: whichever comes first.
+    let output = train.wait();
+    let summary: Value = serde_json::from_slice(&output.stdout).unwrap();
+    nothing_was_lost(&folder, &summary);
+    wait_until_gone(victim);
+    let log = fs::read_to_string(folder.run_dir().join("logs/learner.log")).unwrap();
+    assert!(log.contains("an actor hangs"), "{log}");
+}
+
+#[test]
+fn an_interrupted_run_goes_on_where_it_was() {
+    let folder = RunFolder::new();
+    let mut train = folder.start(&[RUN, &["--actors", "2"]].concat());
+    train.wait_for("progress", |status| status["env_steps"].as_u64() >= Some(100));
+    train.signal(Signal::INT);
+    assert_eq!(train.wait().status.code(), Some(130));
+    // Killed with everything it started, the hard way.
+    let mut train = Train::resume(&folder, &["--actors", "3"]);
+    let status = train.wait_for("progress", |status| status["env_steps"].as_u64() >= Some(400));
+    pids(&status).into_iter().for_each(|pid| kill(pid, Signal::KILL));
+    train.signal(Signal::KILL);
+    train.wait();
+    pids(&status).into_iter().for_each(wait_until_gone);
+    nothing_was_lost(&folder, &Train::resume(&folder, &[]).finish());
+}
+
+#[test]
+fn a_finished_run_goes_on_to_more_steps() {
+    let folder = RunFolder::new();
+    folder.train(&[RUN, &["--steps", "300"]].concat());
+    let longer = Train::resume(&folder, &["--steps", "800"]).finish();
+    nothing_was_lost(&folder, &longer);
+}
+
+#[test]
+fn a_damaged_checkpoint_is_reported_and_the_one_before_is_used() {
+    let folder = RunFolder::new();
+    folder.train(&[RUN, &["--steps", "300"]].concat());
+    let newest = fs::canonicalize(folder.run_dir().join("checkpoints/latest")).unwrap();
+    fs::write(newest.join("state.safetensors"), "damaged").unwrap();
+    let summary = Train::resume(&folder, &["--steps", "800"]).finish();
+    nothing_was_lost(&folder, &summary);
+    let log = fs::read_to_string(folder.run_dir().join("logs/learner.log")).unwrap();
+    assert!(log.contains("a checkpoint is damaged; the one before is used"), "{log}");
+
+    // All of them damaged: never a silent fresh start.
+    for entry in fs::read_dir(folder.run_dir().join("checkpoints")).unwrap() {
+        fs::write(entry.unwrap().path().join("SHA256SUMS"), "").unwrap();
+    }
+    let refused = Train::resume(&folder, &["--steps", "900"]).wait();
+    assert_eq!(refused.status.code(), Some(2));
+    let stderr = String::from_utf8_lossy(&refused.stderr);
+    assert!(stderr.contains("no checkpoint in") && stderr.contains("was altered"), "{stderr}");
+    assert!(folder.run_dir().join("summary.json").exists(), "nothing was overwritten");
+}
+
+#[test]
+fn a_learner_that_dies_again_and_again_is_given_up() {
+    let folder = RunFolder::new();
+    let mut train = folder.start(&["matrix-game", "--actors", "1"]);
+    let mut killed = 0;
+    for _ in 0..5 {
+        let status = train.wait_for("a learner", |status| learner_pid(status) != killed);
+        killed = learner_pid(&status);
+        kill(killed, Signal::KILL);
+    }
+    let output = train.wait();
+    assert_eq!(output.status.code(), Some(1));
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert!(stderr.contains("error: learner died 5 times within 60 s and is given up"), "{stderr}");
+    assert!(shared_memory_of(&folder.run_dir()).is_empty());
+}
+
+#[test]
+fn what_would_change_the_result_cannot_change() {
+    let folder = RunFolder::new();
+    folder.train(&[RUN, &["--steps", "100"]].concat());
+    let refused = Train::resume(&folder, &["--set", "algorithm.gamma=0.5"]).wait();
+    assert_eq!(refused.status.code(), Some(2));
+    let stderr = String::from_utf8_lossy(&refused.stderr);
+    assert!(stderr.contains("algorithm.gamma cannot change in a run that has begun"), "{stderr}");
+}

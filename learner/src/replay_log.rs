@@ -1,0 +1,330 @@
+//! Replay on disk: every episode that entered training, in order of number, as the frames of the wire.
+//!
+//! Files of a fixed number of frames, each frame of the run's one length, so an episode's place follows from its
+//! number. A checkpoint after N episodes needs the last `buffer_size` frames before N to be durable; what lies
+//! behind N was written by a learner that died, and is cut off.
+
+use rit_episode::{
+    Episode,
+    wire::{self, EncodeError, Expected, Frame, Header, PayloadLayout, Rejection, RunId},
+};
+use std::{
+    fs::{self, File, OpenOptions},
+    io::{self, ErrorKind, Read as _, Seek as _, SeekFrom, Write as _},
+    ops::Range,
+    path::{Path, PathBuf},
+};
+
+/// Frames of one file.
+const FRAMES_PER_FILE: u64 = 512;
+
+/// Why replay cannot be written or read.
+#[derive(Debug, thiserror::Error)]
+pub enum ReplayLogError {
+    /// The system refused.
+    #[error("{path}: {error}{}", remedy(error))]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        error: io::Error,
+    },
+    /// An episode that does not fit the run's dims.
+    #[error(transparent)]
+    Encode(#[from] EncodeError),
+    /// A frame that is not what was written.
+    #[error("{path}: episode {number}: {rejection}")]
+    Frame {
+        /// The file.
+        path: PathBuf,
+        /// The episode.
+        number: u64,
+        /// What is wrong with it.
+        rejection: Rejection,
+    },
+    /// A frame of another episode.
+    #[error("{path}: episode {found} lies where {expected} should")]
+    OutOfOrder {
+        /// The file.
+        path: PathBuf,
+        /// The number found.
+        found: u64,
+        /// The number expected.
+        expected: u64,
+    },
+}
+
+/// What a person can do about a failed write.
+pub(crate) fn remedy(error: &io::Error) -> &'static str {
+    match error.kind() {
+        ErrorKind::StorageFull | ErrorKind::QuotaExceeded => "; free some space, training goes on meanwhile",
+        ErrorKind::ReadOnlyFilesystem | ErrorKind::PermissionDenied => {
+            "; make the run directory writable again"
+        }
+        _ => "",
+    }
+}
+
+/// Writes replay.
+#[derive(Debug)]
+pub struct ReplayLog {
+    folder: PathBuf,
+    layout: PayloadLayout,
+    run_id: RunId,
+    frame: Frame,
+    /// The next episode's number.
+    next: u64,
+    file: Option<File>,
+}
+
+impl ReplayLog {
+    /// Goes on behind episode `next` − 1: whatever lies behind it is cut off.
+    ///
+    /// # Errors
+    /// When the folder cannot be made or cut.
+    pub fn open(
+        folder: &Path,
+        layout: PayloadLayout,
+        run_id: RunId,
+        next: u64,
+    ) -> Result<Self, ReplayLogError> {
+        let log =
+            Self { folder: folder.to_owned(), layout, run_id, frame: Frame::new(&layout), next, file: None };
+        let io = |error| ReplayLogError::Io { path: folder.to_owned(), error };
+        fs::create_dir_all(folder).map_err(io)?;
+        for first in files(folder).map_err(io)? {
+            let path = log.path(first);
+            let frames = next.saturating_sub(first).min(FRAMES_PER_FILE);
+            let cut = if frames == 0 {
+                fs::remove_file(&path)
+            } else {
+                OpenOptions::new().write(true).open(&path).and_then(|file| {
+                    let keep = frames * log.frame_len();
+                    if file.metadata()?.len() > keep { file.set_len(keep) } else { Ok(()) }
+                })
+            };
+            cut.map_err(|error| ReplayLogError::Io { path, error })?;
+        }
+        Ok(log)
+    }
+
+    /// Writes the next episode. A failed write leaves the log as it was.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn append(&mut self, episode: &Episode) -> Result<(), ReplayLogError> {
+        debug_assert_eq!(episode.number, self.next, "episodes come in order");
+        wire::encode(episode, &self.layout, self.run_id, 0, &mut self.frame)?;
+        let (first, at) = (self.next - self.next % FRAMES_PER_FILE, self.next % FRAMES_PER_FILE);
+        let (path, begin) = (self.path(first), at * self.frame_len());
+        let io = |error| ReplayLogError::Io { path: path.clone(), error };
+        if at == 0 {
+            self.sync()?;
+            self.file = None;
+        }
+        let mut file = match self.file.take() {
+            Some(file) => file,
+            None => {
+                let opened = OpenOptions::new().create(true).truncate(false).write(true).open(&path);
+                let mut file = opened.map_err(io)?;
+                file.seek(SeekFrom::Start(begin)).map_err(io)?;
+                file
+            }
+        };
+        let written = file
+            .write_all(bytemuck::bytes_of(&self.frame.header))
+            .and_then(|()| file.write_all(&self.frame.payload));
+        if let Err(error) = written {
+            // Part of a frame may have been written: the next attempt opens the file anew and begins there again.
+            let _ = file.set_len(begin);
+            return Err(io(error));
+        }
+        self.file = Some(file);
+        self.next += 1;
+        Ok(())
+    }
+
+    /// Makes all that was written durable.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn sync(&mut self) -> Result<(), ReplayLogError> {
+        let path = self.folder.clone();
+        let synced = self.file.as_ref().map_or(Ok(()), File::sync_data);
+        let synced = synced.and_then(|()| File::open(&path)?.sync_all());
+        synced.map_err(|error| ReplayLogError::Io { path, error })
+    }
+
+    /// Removes files that hold nothing but episodes before this one.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn forget_before(&self, number: u64) -> Result<(), ReplayLogError> {
+        let io = |path: &Path| {
+            let path = path.to_owned();
+            move |error| ReplayLogError::Io { path, error }
+        };
+        for first in files(&self.folder).map_err(io(&self.folder))? {
+            if first + FRAMES_PER_FILE <= number {
+                let path = self.path(first);
+                fs::remove_file(&path).map_err(io(&path))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// The next episode's number: all before it are written.
+    pub fn next(&self) -> u64 {
+        self.next
+    }
+
+    fn path(&self, first: u64) -> PathBuf {
+        path(&self.folder, first)
+    }
+
+    fn frame_len(&self) -> u64 {
+        frame_len(&self.layout)
+    }
+}
+
+/// Reads episodes back, each checked as a frame from shared memory is.
+///
+/// # Errors
+/// When one is missing or is not what was written.
+pub fn read(folder: &Path, expected: &Expected, numbers: Range<u64>) -> Result<Vec<Episode>, ReplayLogError> {
+    let mut episodes = Vec::with_capacity((numbers.end - numbers.start) as usize);
+    let mut file: Option<(PathBuf, io::BufReader<File>)> = None;
+    let mut header = bytemuck::Zeroable::zeroed();
+    let mut payload = vec![0; expected.layout.len()];
+    for number in numbers {
+        let at = number % FRAMES_PER_FILE;
+        let (path, reader) = match &mut file {
+            Some(open) if at > 0 => open,
+            file => {
+                let path = path(folder, number - at);
+                let opened = File::open(&path).and_then(|mut file| {
+                    file.seek(SeekFrom::Start(at * frame_len(&expected.layout)))?;
+                    Ok(io::BufReader::with_capacity(1 << 20, file))
+                });
+                let reader = opened.map_err(|error| ReplayLogError::Io { path: path.clone(), error })?;
+                file.insert((path, reader))
+            }
+        };
+        let read = reader
+            .read_exact(bytemuck::bytes_of_mut::<Header>(&mut header))
+            .and_then(|()| reader.read_exact(&mut payload));
+        read.map_err(|error| ReplayLogError::Io { path: path.clone(), error })?;
+        let episode = wire::decode(&header, &payload, expected)
+            .map_err(|rejection| ReplayLogError::Frame { path: path.clone(), number, rejection })?;
+        if episode.number != number {
+            let (path, found) = (path.clone(), episode.number);
+            return Err(ReplayLogError::OutOfOrder { path, found, expected: number });
+        }
+        episodes.push(episode);
+    }
+    Ok(episodes)
+}
+
+fn frame_len(layout: &PayloadLayout) -> u64 {
+    (size_of::<Header>() + layout.len()) as u64
+}
+
+fn path(folder: &Path, first: u64) -> PathBuf {
+    folder.join(format!("{first:012}.frames"))
+}
+
+/// The first numbers of the files there are.
+fn files(folder: &Path) -> io::Result<Vec<u64>> {
+    let mut firsts = Vec::new();
+    for entry in fs::read_dir(folder)? {
+        let name = entry?.file_name();
+        let first: Option<u64> =
+            name.to_str().and_then(|name| name.strip_suffix(".frames")).and_then(|n| n.parse().ok());
+        firsts.extend(first);
+    }
+    firsts.sort_unstable();
+    Ok(firsts)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rit_env::{
+        EnvironmentOptions, Split, TaskSet,
+        particle::Script,
+        rollout::{Job, Rollout},
+    };
+    use rit_episode::RunSeed;
+
+    const RUN: RunId = *b"a run's sixteen.";
+
+    fn expected() -> Expected {
+        let tasks = TaskSet::MatrixGame.tasks(Split::Training);
+        Expected {
+            run_id: RUN,
+            layout: PayloadLayout::new(TaskSet::MatrixGame.dims()),
+            tasks: tasks.into_iter().map(rit_env::Task::size).collect(),
+        }
+    }
+
+    fn episodes(numbers: Range<u64>) -> Vec<Episode> {
+        let tasks = TaskSet::MatrixGame.tasks(Split::Training);
+        let mut rollout = Rollout::new(tasks, EnvironmentOptions::default(), RunSeed(3), true);
+        let jobs: Vec<Job> =
+            numbers.map(|number| Job { number, weights_version: 7, epsilon: 1.0, task: None }).collect();
+        rollout.roll(&mut Script::Random, &jobs)
+    }
+
+    fn log(folder: &Path, next: u64) -> ReplayLog {
+        ReplayLog::open(folder, expected().layout, RUN, next).unwrap()
+    }
+
+    #[test]
+    fn episodes_come_back_across_files() {
+        let folder = tempfile::tempdir().unwrap();
+        let all = episodes(0..1300);
+        let mut log = log(folder.path(), 0);
+        all.iter().for_each(|episode| log.append(episode).unwrap());
+        log.sync().unwrap();
+        for range in [0..1300, 511..513, 700..1290, 1299..1300, 5..5] {
+            let expected_ones = &all[range.start as usize..range.end as usize];
+            assert_eq!(read(folder.path(), &expected(), range).unwrap(), expected_ones);
+        }
+        log.forget_before(1030).unwrap();
+        assert!(read(folder.path(), &expected(), 1023..1300).is_err());
+        assert_eq!(read(folder.path(), &expected(), 1024..1300).unwrap(), all[1024..]);
+    }
+
+    #[test]
+    fn what_a_dead_learner_wrote_beyond_the_checkpoint_is_cut_off() {
+        let folder = tempfile::tempdir().unwrap();
+        let all = episodes(0..1100);
+        let mut first = log(folder.path(), 0);
+        all.iter().for_each(|episode| first.append(episode).unwrap());
+        drop(first);
+        let mut second = log(folder.path(), 600);
+        assert!(read(folder.path(), &expected(), 599..601).is_err(), "600 is gone");
+        all[600..700].iter().for_each(|episode| second.append(episode).unwrap());
+        assert_eq!(read(folder.path(), &expected(), 400..700).unwrap(), all[400..700]);
+    }
+
+    #[test]
+    fn what_was_altered_is_noticed() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut log = log(folder.path(), 0);
+        episodes(0..10).iter().for_each(|episode| log.append(episode).unwrap());
+        let path = folder.path().join("000000000000.frames");
+        let good = fs::read(&path).unwrap();
+        let frame = frame_len(&expected().layout) as usize;
+        let error = |bytes: &[u8]| {
+            fs::write(&path, bytes).unwrap();
+            read(folder.path(), &expected(), 0..10).unwrap_err().to_string()
+        };
+        let mut altered = good.clone();
+        altered[3 * frame + 100] ^= 1;
+        assert!(error(&altered).contains("episode 3: the frame's checksum"));
+        let swapped = [&good[frame..2 * frame], &good[..frame], &good[2 * frame..]].concat();
+        assert!(error(&swapped).contains("episode 1 lies where 0 should"));
+        assert!(error(&good[..good.len() - 1]).contains("failed to fill whole buffer"));
+    }
+}

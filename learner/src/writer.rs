@@ -1,0 +1,95 @@
+//! The writing thread: replay as it grows, checkpoints when they are due. Training does not wait for the disk.
+//!
+//! The trainer hands over each episode that entered replay (shared, not copied) and, when a checkpoint is due, a
+//! copy of its state. A disk that refuses costs nothing but the checkpoint: episodes stay queued, at most as many
+//! as replay holds, and the next checkpoint tries again.
+
+use crate::{
+    checkpoint::{self, CheckpointError, TrainingState},
+    replay_log::ReplayLog,
+};
+use rit_algo::Rit;
+use rit_config::RunDir;
+use rit_episode::Episode;
+use std::{
+    collections::VecDeque,
+    path::PathBuf,
+    sync::{Arc, mpsc},
+    time::Instant,
+};
+use tokio::sync::oneshot;
+
+/// Where a checkpoint lies, relative to the run directory; or why it was not written.
+pub type Written = Result<PathBuf, CheckpointError>;
+
+/// What the writer is given, in order.
+#[derive(Debug)]
+pub enum ToWrite {
+    /// The next episode of replay.
+    Episode(Arc<Episode>),
+    /// A checkpoint, and who wants to know of it.
+    Checkpoint(Box<TrainingState>, Option<oneshot::Sender<Written>>),
+}
+
+/// The writer.
+#[derive(Debug)]
+pub struct Writer {
+    /// Where the run lies.
+    pub run_dir: RunDir,
+    /// Whose weights are written.
+    pub rit: Arc<Rit>,
+    /// Replay on disk.
+    pub log: ReplayLog,
+    /// Episodes that replay holds.
+    pub buffer_size: usize,
+    /// Checkpoints kept.
+    pub keep: usize,
+}
+
+impl Writer {
+    /// Writes until nobody gives it anything any more.
+    pub fn run(mut self, queue: &mpsc::Receiver<ToWrite>) {
+        let mut waiting: VecDeque<Arc<Episode>> = VecDeque::new();
+        while let Ok(next) = queue.recv() {
+            match next {
+                ToWrite::Episode(episode) => {
+                    waiting.push_back(episode);
+                    // A failure is told by the checkpoint that needs what is missing.
+                    let _ = self.append(&mut waiting);
+                }
+                ToWrite::Checkpoint(state, answer) => {
+                    let begun = Instant::now();
+                    let written = self.checkpoint(&mut waiting, &state);
+                    let env_steps = state.manifest.progress.env_steps;
+                    match &written {
+                        Ok(path) => {
+                            let ms = begun.elapsed().as_millis();
+                            tracing::info!(path = %path.display(), env_steps, ms, "wrote a checkpoint");
+                        }
+                        Err(error) => tracing::error!(%error, env_steps, "a checkpoint was not written"),
+                    }
+                    if let Some(answer) = answer {
+                        // Whoever asked may have gone.
+                        let _ = answer.send(written);
+                    }
+                }
+            }
+        }
+    }
+
+    fn append(&mut self, waiting: &mut VecDeque<Arc<Episode>>) -> Result<(), CheckpointError> {
+        while let Some(episode) = waiting.front() {
+            self.log.append(episode)?;
+            waiting.pop_front();
+        }
+        Ok(())
+    }
+
+    fn checkpoint(&mut self, waiting: &mut VecDeque<Arc<Episode>>, state: &TrainingState) -> Written {
+        self.append(waiting)?;
+        self.log.sync()?;
+        let path = checkpoint::save(&self.run_dir, &self.rit, state, self.keep)?;
+        self.log.forget_before(checkpoint::replay_needed_from(&self.run_dir, self.buffer_size)?)?;
+        Ok(path)
+    }
+}
