@@ -58,7 +58,9 @@ impl Roller {
     pub(crate) fn rollout(config: &Config) -> Rollout {
         let tasks = config.environment.task_set.tasks(Split::Training);
         let options = config.environment_options();
-        Rollout::new(tasks, options, config.seed, config.algorithm.random_permutation)
+        let algorithm = &config.algorithm;
+        Rollout::new(tasks, options, config.seed, algorithm.random_permutation)
+            .with_exploration_persistence(algorithm.exploration_persistence)
     }
 
     /// Where the run's shared memory lies.

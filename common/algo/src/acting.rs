@@ -4,7 +4,6 @@ use crate::{
     Before, Networks, Rit, Rows,
     decoder::{Decoder, DecoderState, Seen, Tables, best},
 };
-use rand::RngExt as _;
 use rit_episode::{Policy, Turn};
 use rit_nn::{Scratch, View, vectorized};
 use std::sync::Arc;
@@ -129,22 +128,10 @@ vectorized! {
             for (row, action) in group.queries.clone().zip(turn.actions.iter_mut()) {
                 let available = &rows.available[row * n_actions..][..n_actions];
                 let utilities = decoder.decide(params, tables, row, &seen, state);
-                // Drawn whatever ε is, so that the stream stays in step.
-                let explores = turn.exploration.random::<f32>() < turn.epsilon;
-                *action = if explores { any(available, turn.exploration) } else { best(utilities, available) };
+                let random = turn.exploration.explore(row - group.queries.start, available);
+                *action = random.unwrap_or_else(|| best(utilities, available));
                 seen.push(*action);
             }
         }
     }
-}
-
-/// A uniformly random available action; 0 where none is.
-fn any(available: &[u8], rng: &mut rit_episode::Rng) -> u8 {
-    let count = available.iter().filter(|&&flag| flag != 0).count();
-    if count == 0 {
-        return 0;
-    }
-    let choice = rng.random_range(0..count);
-    let mut allowed = available.iter().enumerate().filter(|(_, flag)| **flag != 0);
-    allowed.nth(choice).map_or(0, |(action, _)| action as u8)
 }

@@ -7,7 +7,9 @@ use rit_algo::{
     Acting, Mixing, Rit, RitConfig, TaskRepresentations, TerminalStates, Update, UpdateConfig,
     contrastive::draw_pairing,
 };
-use rit_episode::{End, Episode, Observation, Policy, Rng, RunSeed, Stream, Turn, decision_order};
+use rit_episode::{
+    End, Episode, Exploration, Observation, Policy, Rng, RunSeed, Stream, Turn, decision_order,
+};
 use rit_nn::{OptimizerKind, gradcheck};
 use std::sync::Arc;
 
@@ -134,7 +136,7 @@ fn replay(acting: &mut Acting, slots: &[(usize, &Episode)]) -> Vec<Vec<f32>> {
     let longest = slots.iter().map(|(_, episode)| episode.steps()).max().unwrap_or(0);
     for time in 0..longest {
         let running: Vec<usize> = (0..slots.len()).filter(|&i| time < slots[i].1.steps()).collect();
-        let mut seen: Vec<(Observation, Vec<u8>, Rng)> = running
+        let mut seen: Vec<(Observation, Vec<u8>, Exploration)> = running
             .iter()
             .map(|&i| {
                 let episode = slots[i].1;
@@ -150,7 +152,11 @@ fn replay(acting: &mut Acting, slots: &[(usize, &Episode)]) -> Vec<Vec<f32>> {
                     observation.observable_mut(agent).copy_from_slice(&episode.observable[row * m..][..m]);
                     observation.available_mut(agent)[usize::from(episode.actions[row])] = 1;
                 }
-                (observation, vec![0; n], RunSeed(0).stream(Stream::Exploration, 0))
+                (
+                    observation,
+                    vec![0; n],
+                    Exploration::new(0.0, 0.0, n, RunSeed(0).stream(Stream::Exploration, 0)),
+                )
             })
             .collect();
         let mut turns: Vec<Turn<'_>> = seen
@@ -160,7 +166,6 @@ fn replay(acting: &mut Acting, slots: &[(usize, &Episode)]) -> Vec<Vec<f32>> {
                 slot: slots[i].0,
                 observation,
                 previous_reward: if time == 0 { 0.0 } else { slots[i].1.rewards[time - 1] },
-                epsilon: 0.0,
                 exploration,
                 actions,
             })
@@ -228,31 +233,4 @@ fn threads_change_no_bit() {
     let alone = run(1);
     assert_eq!(alone, run(2));
     assert_eq!(alone, run(4));
-}
-
-#[test]
-fn exploration_is_uniform_over_what_is_available() {
-    let rit = Arc::new(Rit::new(config(1, true, true)).unwrap());
-    let at = params(&rit, 3);
-    let mut acting = Acting::new(Arc::clone(&rit), &at[rit.acting()]);
-    let mut observation = Observation::new(1, 1, D, A);
-    observation.available_mut(0).copy_from_slice(&[1, 0, 1]);
-    let exploration = &mut RunSeed(0).stream(Stream::Exploration, 0);
-    let mut counts = [0; A];
-    for _ in 0..2000 {
-        acting.begin(0, 1);
-        let mut actions = [9];
-        acting.act(&mut [Turn {
-            slot: 0,
-            observation: &observation,
-            previous_reward: 0.0,
-            epsilon: 1.0,
-            exploration,
-            actions: &mut actions,
-        }]);
-        counts[usize::from(actions[0])] += 1;
-    }
-    assert_eq!(counts[1], 0);
-    // 1000 expected, standard deviation 22.
-    assert!((890..1110).contains(&counts[0]), "{counts:?}");
 }

@@ -3,7 +3,8 @@
 use crate::{EnvironmentOptions, Seated, Task};
 use rand::RngExt as _;
 use rit_episode::{
-    Action, End, Episode, EpisodeBuilder, Observation, Policy, Rng, RunSeed, Stream, Turn, decision_order,
+    Action, End, Episode, EpisodeBuilder, Exploration, Observation, Policy, Rng, RunSeed, Stream, Turn,
+    decision_order,
 };
 
 /// An episode to be rolled.
@@ -26,6 +27,7 @@ pub struct Rollout {
     options: EnvironmentOptions,
     seed: RunSeed,
     random_permutation: bool,
+    exploration_persistence: f32,
     /// Worlds that wait for their next episode, by task.
     idle: Vec<Vec<Seated>>,
 }
@@ -35,9 +37,8 @@ struct Running {
     slot: usize,
     task: usize,
     world: Seated,
-    epsilon: f32,
     environment_rng: Rng,
-    exploration: Rng,
+    exploration: Exploration,
     observation: Observation,
     previous_reward: f32,
     actions: Vec<Action>,
@@ -58,7 +59,12 @@ impl Rollout {
     ) -> Self {
         assert!(!tasks.is_empty(), "a rollout needs a task");
         let idle = tasks.iter().map(|_| Vec::new()).collect();
-        Self { tasks, options, seed, random_permutation, idle }
+        Self { tasks, options, seed, random_permutation, exploration_persistence: 0.0, idle }
+    }
+
+    /// Explores with this probability that a random action is the agent's last random one again.
+    pub fn with_exploration_persistence(self, exploration_persistence: f32) -> Self {
+        Self { exploration_persistence, ..self }
     }
 
     /// Rolls all jobs side by side to their ends and returns their episodes in the jobs' order.
@@ -105,9 +111,13 @@ impl Rollout {
             slot,
             task,
             world,
-            epsilon: job.epsilon,
             environment_rng,
-            exploration: stream(Stream::Exploration),
+            exploration: Exploration::new(
+                job.epsilon,
+                self.exploration_persistence,
+                n_agents,
+                stream(Stream::Exploration),
+            ),
             builder: EpisodeBuilder::new(job.number, job.weights_version, task, order, &observation),
             observation,
             previous_reward: 0.0,
@@ -122,7 +132,6 @@ impl Running {
             slot: self.slot,
             observation: &self.observation,
             previous_reward: self.previous_reward,
-            epsilon: self.epsilon,
             exploration: &mut self.exploration,
             actions: &mut self.actions,
         }

@@ -7,6 +7,7 @@
 pub mod decision_order;
 mod dims;
 mod episode;
+mod exploration;
 mod observation;
 mod policy;
 pub mod streams;
@@ -14,6 +15,7 @@ pub mod wire;
 
 pub use dims::{Dims, DimsError};
 pub use episode::{End, Episode, EpisodeBuilder};
+pub use exploration::Exploration;
 pub use observation::Observation;
 pub use policy::{Policy, Turn};
 pub use streams::{Rng, RunSeed, Stream};

@@ -1,6 +1,6 @@
 //! Whoever chooses joint actions: the acting networks, or a script.
 
-use crate::{Action, Observation, Rng};
+use crate::{Action, Exploration, Observation};
 
 /// One running episode's turn: what is seen, and where its joint action goes.
 #[derive(Debug)]
@@ -11,10 +11,8 @@ pub struct Turn<'a> {
     pub observation: &'a Observation,
     /// Team reward of the previous step; 0 at the first.
     pub previous_reward: f32,
-    /// Probability of a random action, per agent.
-    pub epsilon: f32,
-    /// The episode's own stream for exploration.
-    pub exploration: &'a mut Rng,
+    /// Which actions are to be random.
+    pub exploration: &'a mut Exploration,
     /// The joint action to be written, in decision order, `[n_agents]`.
     pub actions: &'a mut [Action],
 }

@@ -4,7 +4,6 @@ use super::world::{
     KIND, POSITION, VELOCITY, Vector, scaled, squared_distance, squared_distance_to_nearest, sum,
 };
 use crate::{BodyKind, UnknownName};
-use rand::RngExt as _;
 use rit_episode::{Action, Observation, Policy, Turn};
 use std::{fmt, str::FromStr};
 
@@ -51,12 +50,7 @@ impl Policy for Script {
 
 fn act_randomly(turn: &mut Turn<'_>) {
     for (agent, to) in turn.actions.iter_mut().enumerate() {
-        *to = loop {
-            let action = turn.exploration.random_range(0..turn.observation.n_actions()) as Action;
-            if turn.observation.allows(agent, action) {
-                break action;
-            }
-        };
+        *to = turn.exploration.any(turn.observation.available_to(agent));
     }
 }
 

@@ -3,7 +3,8 @@ use crate::{
     EnvironmentOptions, Split, TaskSet,
     rollout::{Job, Rollout},
 };
-use rit_episode::{RunSeed, Stream};
+use rand::RngExt as _;
+use rit_episode::{Exploration, RunSeed, Stream};
 
 /// Mean total reward of a script over testing tasks, mixed evenly, and its standard error.
 fn mean_reward(set: TaskSet, mut script: Script, episodes: usize) -> (f64, f64) {
@@ -70,8 +71,12 @@ fn act(mut script: Script, observation: &Observation) -> Vec<Action> {
         slot: 0,
         observation,
         previous_reward: 0.0,
-        epsilon: 0.0,
-        exploration: &mut RunSeed(0).stream(Stream::Exploration, 0),
+        exploration: &mut Exploration::new(
+            0.0,
+            0.0,
+            observation.n_agents(),
+            RunSeed(0).stream(Stream::Exploration, 0),
+        ),
         actions: &mut actions,
     }]);
     actions
