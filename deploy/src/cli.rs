@@ -26,6 +26,8 @@ pub enum Command {
     Evaluate(EvaluateOptions),
     /// Ask something of a running learner
     Ctl(CtlOptions),
+    /// Kill a run's processes at random moments, and hold its end to that of an undisturbed run
+    Soak(SoakOptions),
     /// Measure a part beside the machine's limit
     Bench(BenchOptions),
     /// List the experiments that come with the program
@@ -115,6 +117,34 @@ pub struct EvaluateOptions {
     /// Seed of the evaluation; without it one that follows from the run's
     #[arg(long)]
     pub seed: Option<u64>,
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+#[derive(Args, Debug)]
+pub struct SoakOptions {
+    /// Name of an experiment or path of a TOML file
+    #[arg(default_value = "matrix-game")]
+    pub experiment: String,
+    /// Kills, spread over the run
+    #[arg(long, default_value_t = 10, value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..=100_000))]
+    pub kills: usize,
+    /// Seed of both runs, and of the moments and victims
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Actor processes
+    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub actors: u32,
+    /// Environment steps of each run; without it the experiment's own number
+    #[arg(long)]
+    pub steps: Option<u64>,
+    /// Set any key of both runs; may be given again and again
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub settings: Vec<String>,
+    /// Folder for both runs and their logs, to be made
+    #[arg(long, value_name = "DIR", default_value = "runs/soak")]
+    pub dir: PathBuf,
     /// Print JSON
     #[arg(long)]
     pub json: bool,

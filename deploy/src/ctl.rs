@@ -2,18 +2,16 @@
 
 use crate::{
     cli::{CtlCommand, CtlOptions},
+    control,
     failure::Failure,
     report,
 };
 use rit_config::RunDir;
-use rit_proto::{
-    transport,
-    v1::{
-        CheckpointRequest, EvaluateRequest, Evaluation, PauseRequest, ResumeRequest, RunStatus,
-        StatusRequest, StopRequest, control_client::ControlClient,
-    },
+use rit_proto::v1::{
+    CheckpointRequest, EvaluateRequest, Evaluation, PauseRequest, ResumeRequest, RunStatus, StatusRequest,
+    StopRequest,
 };
-use std::{fs, process::ExitCode};
+use std::process::ExitCode;
 
 /// `rit ctl`.
 #[allow(clippy::print_stdout, reason = "what the command is for")]
@@ -22,14 +20,7 @@ pub async fn run(options: CtlOptions) -> Result<ExitCode, Failure> {
         return Err(Failure::input_message("which run? give --run DIR"));
     };
     let (run_dir, _) = RunDir::open(run)?;
-    let address = fs::read_to_string(run_dir.address()).map_err(|_| {
-        let root = run_dir.root().display();
-        Failure::runtime_message(format!(
-            "no learner runs for {root}; start it with `rit learner --run-dir {root}`"
-        ))
-    })?;
-    let address = address.trim().parse().map_err(Failure::runtime)?;
-    let mut control = ControlClient::new(transport::connect(&address, run_dir.token()).await?);
+    let mut control = control::connect(&run_dir).await?;
     let text = match options.command {
         CtlCommand::Status => status(&control.status(StatusRequest {}).await?.into_inner(), options.json)?,
         CtlCommand::Pause => status(&control.pause(PauseRequest {}).await?.into_inner(), options.json)?,

@@ -3,6 +3,7 @@
 
 mod bench;
 mod cli;
+mod control;
 mod ctl;
 mod evaluate;
 mod experiments;
@@ -12,6 +13,7 @@ mod processes;
 mod progress;
 mod report;
 mod shutdown;
+mod soak;
 mod supervisor;
 mod train;
 
@@ -46,6 +48,7 @@ async fn run(cli: Cli) -> Result<ExitCode, Failure> {
         Command::Actor(options) => processes::actor(options, logs).await,
         Command::Evaluate(options) => evaluate::run(&options),
         Command::Ctl(options) => ctl::run(options).await,
+        Command::Soak(options) => soak::run(options).await,
         Command::Bench(options) => bench::run(&options),
         Command::Experiments => experiments::print(),
     }

@@ -19,4 +19,4 @@ pub mod weights;
 pub mod weights_file;
 pub mod writer;
 
-pub use run::{LearnerError, run};
+pub use run::{LearnerError, expected, run};

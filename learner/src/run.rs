@@ -102,12 +102,7 @@ pub async fn run(
     };
     let incoming = Incoming::bind(&address).await?;
     let rit = Arc::new(Rit::new(config.rit())?);
-    let task_set = config.environment.task_set;
-    let expected = Expected {
-        run_id: run_dir.run_id(),
-        layout: PayloadLayout::new(task_set.dims()),
-        tasks: task_set.tasks(Split::Training).into_iter().map(rit_env::Task::size).collect(),
-    };
+    let expected = expected(&run_dir, &config);
     let space = RunSpace::new(&run_dir.shared_memory_root())?;
     let receiver = EpisodeReceiver::create(&space, Limits::new(expected.layout.len(), config.actors.count))?;
 
@@ -198,6 +193,16 @@ pub async fn run(
     let result = training.await.map_err(|_| LearnerError::Panicked("train"))?;
     writing.await.map_err(|_| LearnerError::Panicked("write"))?;
     Ok(result?)
+}
+
+/// What every episode of this run must look like.
+pub fn expected(run_dir: &RunDir, config: &Config) -> Expected {
+    let task_set = config.environment.task_set;
+    Expected {
+        run_id: run_dir.run_id(),
+        layout: PayloadLayout::new(task_set.dims()),
+        tasks: task_set.tasks(Split::Training).into_iter().map(rit_env::Task::size).collect(),
+    }
 }
 
 /// The newest checkpoint that can be used, if any was ever written.
