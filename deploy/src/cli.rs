@@ -182,6 +182,8 @@ pub enum BenchKind {
     Env,
     /// Frames through shared memory
     Ipc,
+    /// Costs as agents, entities and actors grow
+    Scale,
 }
 
 impl fmt::Display for BenchKind {
@@ -191,6 +193,7 @@ impl fmt::Display for BenchKind {
             Self::Rollout => "rollout",
             Self::Env => "env",
             Self::Ipc => "ipc",
+            Self::Scale => "scale",
         })
     }
 }

@@ -108,12 +108,17 @@ impl ReplayLog {
         Ok(log)
     }
 
-    /// Writes the next episode. A failed write leaves the log as it was.
+    /// Writes the next episode, or a later one: those between are nobody's any more, and their place stays empty. A
+    /// failed write leaves the log as it was.
     ///
     /// # Errors
     /// When the disk refuses.
     pub fn append(&mut self, episode: &Episode) -> Result<(), ReplayLogError> {
-        debug_assert_eq!(episode.number, self.next, "episodes come in order");
+        debug_assert!(episode.number >= self.next, "episodes come in order");
+        if episode.number > self.next {
+            self.file = None;
+            self.next = episode.number;
+        }
         wire::encode(episode, &self.layout, self.run_id, 0, &mut self.frame)?;
         let (first, at) = (self.next - self.next % FRAMES_PER_FILE, self.next % FRAMES_PER_FILE);
         let (path, begin) = (self.path(first), at * self.frame_len());
@@ -306,6 +311,17 @@ mod tests {
         assert!(read(folder.path(), &expected(), 599..601).is_err(), "600 is gone");
         all[600..700].iter().for_each(|episode| second.append(episode).unwrap());
         assert_eq!(read(folder.path(), &expected(), 400..700).unwrap(), all[400..700]);
+    }
+
+    #[test]
+    fn what_replay_has_forgotten_before_it_could_be_written_is_left_out() {
+        let folder = tempfile::tempdir().unwrap();
+        let all = episodes(0..800);
+        let mut log = log(folder.path(), 0);
+        all[..100].iter().chain(&all[300..800]).for_each(|episode| log.append(episode).unwrap());
+        assert_eq!(read(folder.path(), &expected(), 0..100).unwrap(), all[..100]);
+        assert_eq!(read(folder.path(), &expected(), 300..800).unwrap(), all[300..]);
+        assert!(read(folder.path(), &expected(), 299..301).is_err(), "299 was never written");
     }
 
     #[test]

@@ -78,6 +78,9 @@ impl Writer {
     }
 
     fn append(&mut self, waiting: &mut VecDeque<Arc<Episode>>) -> Result<(), CheckpointError> {
+        // What replay has forgotten meanwhile is not needed on disk either.
+        let forgotten = waiting.len().saturating_sub(self.buffer_size);
+        waiting.drain(..forgotten);
         while let Some(episode) = waiting.front() {
             self.log.append(episode)?;
             waiting.pop_front();

@@ -5,6 +5,7 @@ use crate::failure::Failure;
 use faer::Accum;
 use rit_algo::{Rit, Update};
 use rit_config::Config;
+use rit_env::{Split, Task};
 use rit_episode::Stream;
 use rit_learner::replay::Replay;
 use rit_nn::{View, ViewMut, matmul};
@@ -17,14 +18,55 @@ use std::{
 /// Side of the large product that stands for this core's limit.
 const LARGE: usize = 2048;
 
+/// What one update costs.
+pub(super) struct Cost {
+    pub updates: u32,
+    pub cpu_s: f64,
+    pub wall_s: f64,
+    pub flops: u64,
+    pub parameters: usize,
+    pub replay_episodes: usize,
+    pub replay_bytes: usize,
+}
+
 pub(super) fn run(config: &Config, duration: Duration) -> Result<Report, Failure> {
+    let tasks = config.environment.task_set.tasks(Split::Training);
+    let limit_before = large_product_flops();
+    let cost = measure(config, &tasks, config.algorithm.buffer_size, duration)?;
+    // A shared machine's speed drifts: the limit is measured before and after.
+    let limit = f64::midpoint(limit_before, large_product_flops());
+
+    let (count, flops, cpu) = (f64::from(cost.updates), cost.flops as f64, cost.cpu_s);
+    let mut report = Report::new();
+    report.insert("update_cpu_ms".into(), (1e3 * cpu / count).into());
+    report.insert("update_wall_ms".into(), (1e3 * cost.wall_s / count).into());
+    report.insert("update_gflop".into(), (flops / count * 1e-9).into());
+    report.insert("gemm_gflop_per_cpu_s".into(), (flops / cpu * 1e-9).into());
+    report.insert("limit_gflop_per_cpu_s".into(), (limit * 1e-9).into());
+    report.insert("gemm_share".into(), (flops / cpu / limit).into());
+    report.insert("limit".into(), format!("one thread's {LARGE}³ f32 product, before and after").into());
+    report.insert("updates".into(), cost.updates.into());
+    report.insert("parameters".into(), cost.parameters.into());
+    report.insert("replay_episodes".into(), cost.replay_episodes.into());
+    report.insert("replay_mb".into(), (cost.replay_bytes as f64 * 1e-6).into());
+    report.insert("peak_rss_mb".into(), peak_rss_mb().into());
+    Ok(report)
+}
+
+/// Makes updates from a replay of so many episodes of these tasks for so long, three at least.
+pub(super) fn measure(
+    config: &Config,
+    tasks: &[Task],
+    replay_episodes: usize,
+    duration: Duration,
+) -> Result<Cost, Failure> {
     let rit = Arc::new(Rit::new(config.rit()).map_err(Failure::input)?);
     let params = rit.layout.initial(&mut config.seed.stream(Stream::Weights, 0));
     let mut update = Update::new(Arc::clone(&rit), config.update(), params).map_err(Failure::runtime)?;
-    let mut replay = Replay::new(config.algorithm.buffer_size);
-    let mut episode_bytes = 0;
-    for episode in random_episodes(config, config.algorithm.buffer_size as u64) {
-        episode_bytes += episode.bytes();
+    let mut replay = Replay::new(replay_episodes);
+    let mut replay_bytes = 0;
+    for episode in random_episodes(config, tasks, replay_episodes as u64) {
+        replay_bytes += episode.bytes();
         replay.insert(Arc::new(episode));
     }
 
@@ -38,32 +80,21 @@ pub(super) fn run(config: &Config, duration: Duration) -> Result<Report, Failure
     for _ in 0..3 {
         one_update(&mut update);
     }
-    let limit_before = large_product_flops();
     let (cpu, wall, flops) = (cpu_s(), Instant::now(), matmul::flops());
     let mut updates = 0;
     while wall.elapsed() < duration || updates < 3 {
         one_update(&mut update);
         updates += 1;
     }
-    let (cpu, wall, flops) = (cpu_s() - cpu, wall.elapsed().as_secs_f64(), matmul::flops() - flops);
-    // A shared machine's speed drifts: the limit is measured before and after.
-    let limit = f64::midpoint(limit_before, large_product_flops());
-
-    let count = f64::from(updates);
-    let mut report = Report::new();
-    report.insert("update_cpu_ms".into(), (1e3 * cpu / count).into());
-    report.insert("update_wall_ms".into(), (1e3 * wall / count).into());
-    report.insert("update_gflop".into(), (flops as f64 / count * 1e-9).into());
-    report.insert("gemm_gflop_per_cpu_s".into(), (flops as f64 / cpu * 1e-9).into());
-    report.insert("limit_gflop_per_cpu_s".into(), (limit * 1e-9).into());
-    report.insert("gemm_share".into(), (flops as f64 / cpu / limit).into());
-    report.insert("limit".into(), format!("one thread's {LARGE}³ f32 product, before and after").into());
-    report.insert("updates".into(), updates.into());
-    report.insert("parameters".into(), rit.layout.len().into());
-    report.insert("replay_episodes".into(), replay.len().into());
-    report.insert("replay_mb".into(), (episode_bytes as f64 * 1e-6).into());
-    report.insert("peak_rss_mb".into(), peak_rss_mb().into());
-    Ok(report)
+    Ok(Cost {
+        updates,
+        cpu_s: cpu_s() - cpu,
+        wall_s: wall.elapsed().as_secs_f64(),
+        flops: matmul::flops() - flops,
+        parameters: rit.layout.len(),
+        replay_episodes: replay.len(),
+        replay_bytes,
+    })
 }
 
 /// This core's rate on one large product: multiplications and additions per CPU second.

@@ -7,6 +7,7 @@ mod env;
 mod ipc;
 mod learner;
 mod rollout;
+mod scale;
 
 use crate::{
     cli::{BenchKind, BenchOptions},
@@ -15,7 +16,7 @@ use crate::{
 };
 use rit_config::Config;
 use rit_env::{
-    Split,
+    Task,
     particle::Script,
     rollout::{Job, Rollout},
 };
@@ -35,6 +36,7 @@ pub fn run(options: &BenchOptions) -> Result<ExitCode, Failure> {
         BenchKind::Rollout => rollout::run(&config, duration)?,
         BenchKind::Env => env::run(&config, duration),
         BenchKind::Ipc => ipc::run(options.payload_kib, duration)?,
+        BenchKind::Scale => scale::run(&config, &options.experiment, &settings, duration)?,
     };
     report.insert("bench".into(), options.kind.to_string().into());
     if !matches!(options.kind, BenchKind::Ipc) {
@@ -50,11 +52,30 @@ pub fn run(options: &BenchOptions) -> Result<ExitCode, Failure> {
                     println!("{key:width$}  {:.3}", number.as_f64().unwrap_or_default());
                 }
                 Value::String(text) => println!("{key:width$}  {text}"),
+                Value::Array(rows) => println!("\n{key}\n{}", table(rows)),
                 value => println!("{key:width$}  {value}"),
             }
         }
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// Rows of one kind, a line each.
+fn table(rows: &[Value]) -> String {
+    let objects: Vec<&Map<String, Value>> = rows.iter().filter_map(Value::as_object).collect();
+    let Some(first) = objects.first() else { return String::new() };
+    let mut text: String = first.keys().map(|key| format!("  {key}")).collect();
+    for object in objects {
+        text += "\n";
+        for (key, value) in object {
+            let width = key.len() + 2;
+            text += &match value.as_f64().filter(|_| value.is_f64()) {
+                Some(number) => format!("{number:>width$.2}"),
+                None => format!("{:>width$}", value.to_string().trim_matches('"')),
+            };
+        }
+    }
+    text
 }
 
 /// What a benchmark prints, in this order.
@@ -75,10 +96,9 @@ fn seconds(clock: ClockId) -> f64 {
     time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
 }
 
-/// Episodes of random actions of the experiment's training tasks.
-fn random_episodes(config: &Config, count: u64) -> Vec<Episode> {
-    let tasks = config.environment.task_set.tasks(Split::Training);
-    let mut rollout = Rollout::new(tasks, config.environment_options(), RunSeed(1), true);
+/// Episodes of random actions of these tasks.
+fn random_episodes(config: &Config, tasks: &[Task], count: u64) -> Vec<Episode> {
+    let mut rollout = Rollout::new(tasks.to_vec(), config.environment_options(), RunSeed(1), true);
     let jobs: Vec<Job> =
         (0..count).map(|number| Job { number, weights_version: 0, epsilon: 1.0, task: None }).collect();
     jobs.chunks(64).flat_map(|jobs| rollout.roll(&mut Script::Random, jobs)).collect()

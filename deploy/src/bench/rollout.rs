@@ -5,7 +5,7 @@ use crate::failure::Failure;
 use rit_algo::{Acting, Rit};
 use rit_config::Config;
 use rit_env::{
-    Split,
+    Split, Task,
     rollout::{Job, Rollout},
 };
 use rit_episode::Stream;
@@ -15,14 +15,36 @@ use std::{
     time::{Duration, Instant},
 };
 
+/// What rolling costs.
+pub(super) struct Cost {
+    pub env_steps: u64,
+    pub cpu_s: f64,
+    pub flops: u64,
+}
+
 pub(super) fn run(config: &Config, duration: Duration) -> Result<Report, Failure> {
+    let Cost { env_steps, cpu_s, flops } =
+        measure(config, config.environment.task_set.tasks(Split::Training), duration)?;
+    let mut report = Report::new();
+    report.insert("env_steps_per_cpu_s".into(), (env_steps as f64 / cpu_s).into());
+    report.insert("gemm_gflop_per_cpu_s".into(), (flops as f64 / cpu_s * 1e-9).into());
+    report.insert("env_steps".into(), env_steps.into());
+    report.insert("episodes_side_by_side".into(), side_by_side(config).into());
+    Ok(report)
+}
+
+fn side_by_side(config: &Config) -> u64 {
+    config.actors.episodes_at_once.min(config.algorithm.n_rollout_threads) as u64
+}
+
+/// Rolls episodes of these tasks for so long.
+pub(super) fn measure(config: &Config, tasks: Vec<Task>, duration: Duration) -> Result<Cost, Failure> {
     let rit = Arc::new(Rit::new(config.rit()).map_err(Failure::input)?);
     let params = rit.layout.initial(&mut config.seed.stream(Stream::Weights, 0));
     let mut acting = Acting::new(Arc::clone(&rit), &params[rit.acting()]);
-    let tasks = config.environment.task_set.tasks(Split::Training);
     let mut rollout =
         Rollout::new(tasks, config.environment_options(), config.seed, config.algorithm.random_permutation);
-    let side_by_side = config.actors.episodes_at_once.min(config.algorithm.n_rollout_threads) as u64;
+    let side_by_side = side_by_side(config);
     let mut number = 0;
     let mut roll = |acting: &mut Acting| -> u64 {
         let jobs: Vec<Job> = (number..number + side_by_side)
@@ -37,11 +59,5 @@ pub(super) fn run(config: &Config, duration: Duration) -> Result<Report, Failure
     while wall.elapsed() < duration {
         env_steps += roll(&mut acting);
     }
-    let (cpu, flops) = (cpu_s() - cpu, matmul::flops() - flops);
-    let mut report = Report::new();
-    report.insert("env_steps_per_cpu_s".into(), (env_steps as f64 / cpu).into());
-    report.insert("gemm_gflop_per_cpu_s".into(), (flops as f64 / cpu * 1e-9).into());
-    report.insert("env_steps".into(), env_steps.into());
-    report.insert("episodes_side_by_side".into(), side_by_side.into());
-    Ok(report)
+    Ok(Cost { env_steps, cpu_s: cpu_s() - cpu, flops: matmul::flops() - flops })
 }
