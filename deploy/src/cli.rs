@@ -30,8 +30,15 @@ pub enum Command {
     Soak(SoakOptions),
     /// Measure a part beside the machine's limit
     Bench(BenchOptions),
+    /// Draw learning curves of one or several runs of an experiment
+    Plot(PlotOptions),
     /// List the experiments that come with the program
     Experiments,
+    /// Print completions for a shell, such as `rit completions bash > /etc/bash_completion.d/rit`
+    Completions {
+        /// Which shell
+        shell: clap_complete::Shell,
+    },
 }
 
 /// What makes a run's configuration.
@@ -148,6 +155,22 @@ pub struct SoakOptions {
     /// Print JSON
     #[arg(long)]
     pub json: bool,
+}
+
+#[derive(Args, Debug)]
+pub struct PlotOptions {
+    /// Run directories, or files like their metrics.jsonl; several runs give a mean and the span from lowest to highest
+    #[arg(required = true)]
+    pub runs: Vec<PathBuf>,
+    /// File to write, ending in .svg
+    #[arg(long, value_name = "FILE")]
+    pub out: PathBuf,
+    /// Heading
+    #[arg(long, default_value = "Greedy evaluation of the training tasks")]
+    pub title: String,
+    /// Draw a dashed line at this return, for comparison
+    #[arg(long, value_name = "RETURN", allow_negative_numbers = true)]
+    pub line: Option<f64>,
 }
 
 #[derive(Args, Debug)]

@@ -9,6 +9,7 @@ mod evaluate;
 mod experiments;
 mod failure;
 mod logging;
+mod plot;
 mod processes;
 mod progress;
 mod report;
@@ -17,7 +18,7 @@ mod soak;
 mod supervisor;
 mod train;
 
-use clap::Parser as _;
+use clap::{CommandFactory as _, Parser as _};
 use cli::{Cli, Command};
 use failure::Failure;
 use std::process::ExitCode;
@@ -50,6 +51,11 @@ async fn run(cli: Cli) -> Result<ExitCode, Failure> {
         Command::Ctl(options) => ctl::run(options).await,
         Command::Soak(options) => soak::run(options).await,
         Command::Bench(options) => bench::run(&options),
+        Command::Plot(options) => plot::run(&options),
         Command::Experiments => experiments::print(),
+        Command::Completions { shell } => {
+            clap_complete::generate(shell, &mut Cli::command(), "rit", &mut std::io::stdout());
+            Ok(ExitCode::SUCCESS)
+        }
     }
 }
