@@ -9,4 +9,5 @@ mod world;
 
 pub use cooperative_navigation::CooperativeNavigation;
 pub use predator_prey::{PredatorPrey, PredatorPreyReward};
-pub use scripts::Script;
+pub use scripts::{Script, UnfitScript};
+pub use world::DIRECTIONS;

@@ -1,6 +1,6 @@
 //! The rollout loop: numbered episodes in, finished episodes out. Actors and evaluation share it.
 
-use crate::{EnvironmentOptions, Seated, Task};
+use crate::{Environment, EnvironmentOptions, Seated, Task};
 use rand::RngExt as _;
 use rit_episode::{
     Action, End, Episode, EpisodeBuilder, Exploration, Observation, Policy, Rng, RunSeed, Stream, Turn,
@@ -69,9 +69,21 @@ impl Rollout {
 
     /// Rolls all jobs side by side to their ends and returns their episodes in the jobs' order.
     pub fn roll(&mut self, policy: &mut dyn Policy, jobs: &[Job]) -> Vec<Episode> {
+        self.roll_watched(policy, jobs, |_, _| {})
+    }
+
+    /// As [`Self::roll`], and shows each job's world to `watch`, under the job's index: when its episode has
+    /// begun, and after each step. What was done and earned there is in the [`Episode`].
+    pub fn roll_watched(
+        &mut self,
+        policy: &mut dyn Policy,
+        jobs: &[Job],
+        mut watch: impl FnMut(usize, &dyn Environment),
+    ) -> Vec<Episode> {
         let mut episodes: Vec<Option<Episode>> = jobs.iter().map(|_| None).collect();
         let mut running: Vec<Running> =
             jobs.iter().enumerate().map(|(slot, job)| self.begin(policy, slot, job)).collect();
+        running.iter().for_each(|running| watch(running.slot, running.world.environment()));
         while !running.is_empty() {
             let mut turns: Vec<Turn<'_>> = running.iter_mut().map(Running::turn).collect();
             policy.act(&mut turns);
@@ -79,7 +91,9 @@ impl Rollout {
             running = running
                 .into_iter()
                 .filter_map(|mut running| {
-                    let Some((end, won)) = running.step() else {
+                    let ended = running.step();
+                    watch(running.slot, running.world.environment());
+                    let Some((end, won)) = ended else {
                         return Some(running);
                     };
                     self.idle[running.task].push(running.world);
@@ -150,7 +164,7 @@ impl Running {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Split, TaskSet};
+    use crate::{Split, TaskSet, particle::Script};
     use rit_episode::decision_order::is_permutation;
 
     /// Plays a fixed action by row.
@@ -212,6 +226,28 @@ mod tests {
         assert!(episodes.iter().any(|episode| episode.won) && episodes.iter().any(|episode| !episode.won));
         let unpermuted = rollout(5, false).roll(&mut Fixed([0, 2]), &jobs);
         assert!(unpermuted.iter().all(|episode| episode.won && episode.end == End::Terminated));
+    }
+
+    #[test]
+    fn whoever_watches_sees_every_state_of_the_same_episodes() {
+        let set = TaskSet::PredatorPrey;
+        let new = || Rollout::new(set.tasks(Split::Training), EnvironmentOptions::default(), RunSeed(2), true);
+        let jobs = jobs(0..5);
+        let mut seen = vec![Vec::new(); jobs.len()];
+        let episodes = new().roll_watched(&mut Script::Random, &jobs, |job, world| {
+            seen[job].push(world.scene().unwrap().bodies);
+        });
+        assert_eq!(episodes, new().roll(&mut Script::Random, &jobs), "watching changes nothing");
+        for (scenes, episode) in seen.iter().zip(&episodes) {
+            assert_eq!(scenes.len(), episode.steps() + 1);
+            let rows = episode.entities.chunks_exact(set.dims().entity_dim).enumerate();
+            for (at, features) in rows {
+                let (time, row) = (at / episode.n_entities, at % episode.n_entities);
+                let entity = episode.decision_order.get(row).map_or(row, |&agent| usize::from(agent));
+                let body = scenes[time][entity];
+                assert_eq!([body.x, body.y], features[..2]);
+            }
+        }
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use super::world::{
     KIND, POSITION, VELOCITY, Vector, scaled, squared_distance, squared_distance_to_nearest, sum,
 };
-use crate::{BodyKind, UnknownName};
+use crate::{BodyKind, TaskSet, UnknownName};
 use rit_episode::{Action, Observation, Policy, Turn};
 use std::{fmt, str::FromStr};
 
@@ -31,6 +31,37 @@ pub enum Script {
 impl Script {
     /// Every script.
     pub const ALL: [Self; 4] = [Self::Random, Self::Still, Self::NearestAssignment, Self::Chase];
+
+    /// Whether it has something to do in the tasks of this set.
+    ///
+    /// # Errors
+    /// When it was made for others: it would stand still, or look for features that are not there.
+    pub fn check(self, task_set: TaskSet) -> Result<(), UnfitScript> {
+        if self.fits(task_set) { Ok(()) } else { Err(UnfitScript { script: self, task_set }) }
+    }
+
+    fn fits(self, task_set: TaskSet) -> bool {
+        match self {
+            Self::Random | Self::Still => true,
+            Self::NearestAssignment => task_set == TaskSet::CooperativeNavigation,
+            Self::Chase => matches!(task_set, TaskSet::PredatorPrey | TaskSet::PredatorPreyPro),
+        }
+    }
+}
+
+/// A script made for other tasks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("script {script} is not made for {task_set}; those that are: {}", fitting(*task_set))]
+pub struct UnfitScript {
+    /// The script.
+    pub script: Script,
+    /// The task set it does not fit.
+    pub task_set: TaskSet,
+}
+
+fn fitting(task_set: TaskSet) -> String {
+    let fitting = Script::ALL.into_iter().filter(|script| script.fits(task_set));
+    fitting.map(|script| script.to_string()).collect::<Vec<_>>().join(", ")
 }
 
 impl Policy for Script {

@@ -22,8 +22,8 @@ const CONTACT_MARGIN: f32 = 1e-3;
 /// smallest f32, so their contact force is exactly 0.
 const NO_CONTACT_GAP: f32 = 104.0 * CONTACT_MARGIN;
 
-/// Directions of the actions: none, −x, +x, −y, +y.
-pub(super) const DIRECTIONS: [Vector; 5] = [[0.0, 0.0], [-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]];
+/// Where each action pushes: nowhere, −x, +x, −y, +y.
+pub const DIRECTIONS: [[f32; 2]; 5] = [[0.0, 0.0], [-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]];
 
 /// Columns of an entity's features that hold its position.
 pub(super) const POSITION: Range<usize> = 0..2;

@@ -170,6 +170,25 @@ fn random_takes_available_actions_only() {
 }
 
 #[test]
+fn a_script_made_for_other_tasks_says_so() {
+    for set in TaskSet::ALL {
+        assert_eq!(Script::Random.check(set), Ok(()));
+        assert_eq!(Script::Still.check(set), Ok(()));
+        let found = [Script::NearestAssignment, Script::Chase].map(|script| script.check(set).is_ok());
+        let expected = match set {
+            TaskSet::MatrixGame => [false, false],
+            TaskSet::CooperativeNavigation => [true, false],
+            TaskSet::PredatorPrey | TaskSet::PredatorPreyPro => [false, true],
+        };
+        assert_eq!(found, expected, "{set}");
+    }
+    assert_eq!(
+        Script::NearestAssignment.check(TaskSet::PredatorPrey).unwrap_err().to_string(),
+        "script nearest-assignment is not made for predator-prey; those that are: random, still, chase"
+    );
+}
+
+#[test]
 fn names_lead_back() {
     for script in Script::ALL {
         assert_eq!(script.to_string().parse(), Ok(script));
