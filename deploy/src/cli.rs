@@ -22,7 +22,7 @@ pub enum Command {
     Learner(LearnerOptions),
     /// Start one actor; it joins the learner of a run directory
     Actor(ActorOptions),
-    /// Roll greedy episodes with a run's newest checkpoint
+    /// Roll greedy episodes with a run's newest checkpoint, or with a script
     Evaluate(EvaluateOptions),
     /// Ask something of a running learner
     Ctl(CtlOptions),
@@ -110,11 +110,24 @@ pub struct ActorOptions {
     pub supervised: bool,
 }
 
+/// Who plays, and what.
 #[derive(Args, Debug)]
-pub struct EvaluateOptions {
+pub struct PlayOptions {
+    /// checkpoint: a run's newest weights. script:NAME: random, still, nearest-assignment or chase
+    #[arg(long, default_value = "checkpoint")]
+    pub policy: String,
     /// Run directory
     #[arg(long, value_name = "DIR")]
-    pub run: PathBuf,
+    pub run: Option<PathBuf>,
+    /// Whose tasks a script plays, without a run: name of an experiment or path of a TOML file
+    #[arg(long, value_name = "EXPERIMENT")]
+    pub experiment: Option<String>,
+}
+
+#[derive(Args, Debug)]
+pub struct EvaluateOptions {
+    #[command(flatten)]
+    pub play: PlayOptions,
     /// training, testing, or names of tasks
     #[arg(long, value_delimiter = ',', default_value = "training")]
     pub tasks: Vec<String>,

@@ -1,48 +1,40 @@
-//! `rit evaluate`: greedy episodes with a run's newest checkpoint, in this process.
+//! `rit evaluate`: greedy episodes with a run's newest checkpoint or a script, in this process.
 
-use crate::{cli::EvaluateOptions, failure::Failure, report};
-use rit_algo::{Acting, Rit};
-use rit_config::RunDir;
-use rit_episode::RunSeed;
+use crate::{cli::EvaluateOptions, failure::Failure, player::Player, report};
 use rit_learner::{
-    checkpoint::{LATEST, WEIGHTS},
     evaluation::{Evaluator, TaskResult},
     metrics::by_task,
-    trainer::evaluation_seed,
-    weights_file,
 };
-use std::{process::ExitCode, sync::Arc};
+use std::process::ExitCode;
 
 /// `rit evaluate`.
 #[allow(clippy::print_stdout, reason = "what the command is for")]
 pub fn run(options: &EvaluateOptions) -> Result<ExitCode, Failure> {
-    let (run_dir, config) = RunDir::open(&options.run)?;
-    let evaluator = Evaluator::new(&config);
+    let mut player = Player::new(&options.play)?;
+    let config = &player.config;
+    let evaluator = Evaluator::new(config);
     let tasks = evaluator.tasks(&options.tasks)?;
     if tasks.is_empty() {
         let (task_set, names) = (config.environment.task_set, options.tasks.join(","));
         return Err(Failure::input_message(format!("{task_set} has no tasks {names}")));
     }
-    let path = run_dir.checkpoints().join(LATEST).join(WEIGHTS);
-    if !path.exists() {
-        let root = run_dir.root().display();
-        return Err(Failure::input_message(format!(
-            "{root} has no checkpoint yet; `rit ctl --run {root} checkpoint` writes one"
-        )));
-    }
-    let rit = Arc::new(Rit::new(config.rit()).map_err(Failure::input)?);
-    let params = weights_file::load(&path, &rit)?;
     let episodes = options.episodes.map_or(config.evaluation.episodes, |episodes| episodes as usize);
-    let seed = options.seed.map_or_else(|| evaluation_seed(&config), RunSeed);
-    let mut acting = Acting::new(Arc::clone(&rit), &params[rit.acting()]);
-    let results = evaluator.evaluate(&mut acting, &tasks, episodes, seed);
-    let weights_digest = weights_file::digest(&params);
+    let seed = player.seed(options.seed);
+    let results = evaluator.evaluate(player.policy.as_mut(), &tasks, episodes, seed);
     if options.json {
-        let output = serde_json::json!({ "weights_digest": weights_digest, "tasks": by_task(&results) });
+        let output = serde_json::json!({
+            "policy": player.name,
+            "weights_digest": player.weights_digest,
+            "tasks": by_task(&results),
+        });
         println!("{output:#}");
     } else {
-        print!("{}", report::table(&results.iter().map(TaskResult::to_message).collect::<Vec<_>>()));
-        println!("weights digest {weights_digest}");
+        let mut lines: Vec<_> = results.iter().map(TaskResult::to_message).collect();
+        lines.extend(report::mean(&lines));
+        print!("{}", report::table(&lines));
+        if let Some(digest) = &player.weights_digest {
+            println!("weights digest {digest}");
+        }
     }
     Ok(ExitCode::SUCCESS)
 }

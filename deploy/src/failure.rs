@@ -2,7 +2,7 @@
 
 use rit_actor::ActorError;
 use rit_config::{ConfigError, RunDirError};
-use rit_env::UnknownName;
+use rit_env::{UnknownName, particle::UnfitScript};
 use rit_learner::{LearnerError, weights_file::WeightsFileError};
 use rit_proto::transport::ConnectError;
 use std::{fmt, process::ExitCode};
@@ -73,6 +73,12 @@ impl From<RunDirError> for Failure {
 
 impl From<UnknownName> for Failure {
     fn from(error: UnknownName) -> Self {
+        Self::input(error)
+    }
+}
+
+impl From<UnfitScript> for Failure {
+    fn from(error: UnfitScript) -> Self {
         Self::input(error)
     }
 }

@@ -10,6 +10,7 @@ mod experiments;
 mod failure;
 mod logging;
 mod plot;
+mod player;
 mod processes;
 mod progress;
 mod report;

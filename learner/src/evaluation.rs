@@ -2,10 +2,10 @@
 
 use rit_config::Config;
 use rit_env::{
-    EnvironmentOptions, Split, Task, TaskSet, UnknownName,
+    Environment, EnvironmentOptions, Split, Task, TaskSet, UnknownName,
     rollout::{Job, Rollout},
 };
-use rit_episode::{Policy, RunSeed};
+use rit_episode::{Episode, Policy, RunSeed};
 use rit_proto::v1;
 use serde::{Deserialize, Serialize};
 
@@ -86,6 +86,24 @@ impl Evaluator {
         tasks.iter().map(|&task| self.evaluate_task(policy, task, episodes, seed)).collect()
     }
 
+    /// Rolls the first episodes that [`Self::evaluate`] rolls of a task with this seed, and shows their worlds
+    /// to `watch`; see [`Rollout::roll_watched`].
+    pub fn watch(
+        &self,
+        policy: &mut dyn Policy,
+        task: Task,
+        episodes: usize,
+        seed: RunSeed,
+        watch: impl FnMut(usize, &dyn Environment),
+    ) -> Vec<Episode> {
+        self.rollout(task, seed).roll_watched(policy, &jobs(episodes), watch)
+    }
+
+    fn rollout(&self, task: Task, seed: RunSeed) -> Rollout {
+        let seed = seed.derive(&task.to_string(), 0);
+        Rollout::new(vec![task], self.options, seed, self.random_permutation)
+    }
+
     fn evaluate_task(
         &self,
         policy: &mut dyn Policy,
@@ -93,13 +111,9 @@ impl Evaluator {
         episodes: usize,
         seed: RunSeed,
     ) -> TaskResult {
-        let seed = seed.derive(&task.to_string(), 0);
-        let mut rollout = Rollout::new(vec![task], self.options, seed, self.random_permutation);
-        let jobs: Vec<Job> = (0..episodes as u64)
-            .map(|number| Job { number, weights_version: 0, epsilon: 0.0, task: Some(0) })
-            .collect();
+        let mut rollout = self.rollout(task, seed);
         let (mut total, mut won) = (0.0, 0);
-        for jobs in jobs.chunks(SIDE_BY_SIDE) {
+        for jobs in jobs(episodes).chunks(SIDE_BY_SIDE) {
             for episode in rollout.roll(policy, jobs) {
                 total += episode.total_reward();
                 won += usize::from(episode.won);
@@ -115,9 +129,16 @@ impl Evaluator {
     }
 }
 
+/// So many greedy episodes of a rollout's one task.
+fn jobs(episodes: usize) -> Vec<Job> {
+    let job = |number| Job { number, weights_version: 0, epsilon: 0.0, task: Some(0) };
+    (0..episodes as u64).map(job).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use rit_env::particle::Script;
     use rit_episode::Turn;
 
     /// Plays what wins game 4 of the matrix games, in any order.
@@ -145,5 +166,17 @@ mod tests {
         assert!(
             evaluator.tasks(&["game-5".into()]).unwrap_err().to_string().contains("known: game-1, game-2")
         );
+    }
+    #[test]
+    fn whoever_watches_sees_the_episodes_that_are_measured() {
+        let config = rit_config::resolve("environment.task_set = \"predator-prey\"", "test", &[]).unwrap();
+        let evaluator = Evaluator::new(&config);
+        let task = evaluator.tasks(&["predator-prey-3-2".into()]).unwrap()[0];
+        let mut states = [0; 4];
+        let watched =
+            evaluator.watch(&mut Script::Chase, task, 4, RunSeed(1), |episode, _| states[episode] += 1);
+        let measured = evaluator.evaluate(&mut Script::Chase, &[task], 4, RunSeed(1));
+        let mean = watched.iter().map(Episode::total_reward).sum::<f64>() / 4.0;
+        assert_eq!((mean, states), (measured[0].mean_return, [26; 4]));
     }
 }

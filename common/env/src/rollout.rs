@@ -231,7 +231,8 @@ mod tests {
     #[test]
     fn whoever_watches_sees_every_state_of_the_same_episodes() {
         let set = TaskSet::PredatorPrey;
-        let new = || Rollout::new(set.tasks(Split::Training), EnvironmentOptions::default(), RunSeed(2), true);
+        let new =
+            || Rollout::new(set.tasks(Split::Training), EnvironmentOptions::default(), RunSeed(2), true);
         let jobs = jobs(0..5);
         let mut seen = vec![Vec::new(); jobs.len()];
         let episodes = new().roll_watched(&mut Script::Random, &jobs, |job, world| {

@@ -26,6 +26,20 @@ pub fn output(arguments: &[&str]) -> Output {
     rit(arguments).output().unwrap()
 }
 
+/// Runs `rit` and checks exit code 2 and the one line it prints.
+#[track_caller]
+pub fn refused(arguments: &[&str], message: &[&str]) {
+    let output = output(arguments);
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{arguments:?}: {stderr}");
+    // Before it, only what `rit train` says of the run it makes.
+    let errors: Vec<_> = stderr.lines().filter(|line| !line.contains("run directory /")).collect();
+    assert!(errors.len() == 1 && errors[0].starts_with("error: "), "{stderr}");
+    for part in message {
+        assert!(stderr.contains(part), "{part:?} in {stderr}");
+    }
+}
+
 /// A run directory in a folder of its own.
 pub struct RunFolder {
     folder: TempDir,

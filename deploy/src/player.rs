@@ -1,0 +1,99 @@
+//! Who plays an evaluation or a picture, and what: `--policy`, `--run` and `--experiment`.
+
+use crate::{cli::PlayOptions, experiments, failure::Failure};
+use rit_algo::{Acting, Rit};
+use rit_config::{Config, RunDir};
+use rit_env::particle::Script;
+use rit_episode::{Policy, RunSeed};
+use rit_learner::{
+    checkpoint::{LATEST, WEIGHTS},
+    trainer::evaluation_seed,
+    weights_file,
+};
+use std::sync::Arc;
+
+/// The policy of a checkpoint, as it is typed.
+const CHECKPOINT: &str = "checkpoint";
+/// What the name of a script is typed after.
+const SCRIPT: &str = "script:";
+
+/// A policy and the configuration whose tasks it plays.
+pub struct Player {
+    /// The policy as it is typed.
+    pub name: String,
+    /// Says which tasks there are, and with which options they are played.
+    pub config: Config,
+    /// The policy itself.
+    pub policy: Box<dyn Policy>,
+    /// Digest of the weights, where it has any.
+    pub weights_digest: Option<String>,
+}
+
+impl Player {
+    /// What these options ask for.
+    ///
+    /// # Errors
+    /// When something is missing, unknown, or does not go together.
+    pub fn new(options: &PlayOptions) -> Result<Self, Failure> {
+        match options.policy.strip_prefix(SCRIPT) {
+            Some(name) => Self::script(name.parse()?, options),
+            None if options.policy == CHECKPOINT => Self::checkpoint(options),
+            None => Err(Failure::input_message(format!(
+                "unknown policy {:?}; write {CHECKPOINT} or {SCRIPT}NAME with one of {}",
+                options.policy,
+                Script::ALL.map(|script| script.to_string()).join(", ")
+            ))),
+        }
+    }
+
+    /// The seed that was asked for, or the one that follows from the configuration's: two policies meet the
+    /// same episodes.
+    pub fn seed(&self, asked: Option<u64>) -> RunSeed {
+        asked.map_or_else(|| evaluation_seed(&self.config), RunSeed)
+    }
+
+    fn script(script: Script, options: &PlayOptions) -> Result<Self, Failure> {
+        let config = match (&options.run, &options.experiment) {
+            (Some(run), None) => RunDir::open(run)?.1,
+            (None, Some(experiment)) => experiments::load(experiment, &[])?.config,
+            (Some(_), Some(_)) => {
+                return Err(Failure::input_message(
+                    "both --run and --experiment say what is played; give one",
+                ));
+            }
+            (None, None) => {
+                return Err(Failure::input_message(format!(
+                    "--policy {SCRIPT}{script} does not say what is played; give --experiment NAME or --run DIR"
+                )));
+            }
+        };
+        script.check(config.environment.task_set)?;
+        Ok(Self { name: format!("{SCRIPT}{script}"), config, policy: Box::new(script), weights_digest: None })
+    }
+
+    fn checkpoint(options: &PlayOptions) -> Result<Self, Failure> {
+        if options.experiment.is_some() {
+            return Err(Failure::input_message(format!(
+                "--experiment is for scripts, such as --policy {SCRIPT}random; a checkpoint comes with its --run DIR"
+            )));
+        }
+        let Some(run) = &options.run else {
+            return Err(Failure::input_message(format!(
+                "give --run DIR, whose checkpoint plays, or a --policy {SCRIPT}NAME that needs none"
+            )));
+        };
+        let (run_dir, config) = RunDir::open(run)?;
+        let path = run_dir.checkpoints().join(LATEST).join(WEIGHTS);
+        if !path.exists() {
+            let root = run_dir.root().display();
+            return Err(Failure::input_message(format!(
+                "{root} has no checkpoint yet; `rit ctl --run {root} checkpoint` writes one"
+            )));
+        }
+        let rit = Arc::new(Rit::new(config.rit()).map_err(Failure::input)?);
+        let params = weights_file::load(&path, &rit)?;
+        let policy = Box::new(Acting::new(Arc::clone(&rit), &params[rit.acting()]));
+        let weights_digest = Some(weights_file::digest(&params));
+        Ok(Self { name: CHECKPOINT.to_owned(), config, policy, weights_digest })
+    }
+}
