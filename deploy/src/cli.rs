@@ -24,6 +24,8 @@ pub enum Command {
     Actor(ActorOptions),
     /// Roll greedy episodes with a run's newest checkpoint, or with a script
     Evaluate(EvaluateOptions),
+    /// Draw episodes of a run's newest checkpoint, or of a script
+    Render(RenderOptions),
     /// Ask something of a running learner
     Ctl(CtlOptions),
     /// Kill a run's processes at random moments, and hold its end to that of an undisturbed run
@@ -140,6 +142,32 @@ pub struct EvaluateOptions {
     /// Print JSON
     #[arg(long)]
     pub json: bool,
+}
+
+#[derive(Args, Debug)]
+#[command(after_help = "\
+The file's ending says what is drawn: .gif, every step of the episodes; .png, a row of moments for each episode; \
+.svg, each episode's whole course. Numbers are places in the decision order, arrows what the agents have just done, \
+bars the reward of each step.
+Episodes are those that `rit evaluate` measures with the same seed.")]
+pub struct RenderOptions {
+    #[command(flatten)]
+    pub play: PlayOptions,
+    /// Name of the task
+    #[arg(long)]
+    pub task: String,
+    /// Episodes to draw
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=20))]
+    pub episodes: u8,
+    /// Seed of the episodes; without it one that follows from the run's
+    #[arg(long)]
+    pub seed: Option<u64>,
+    /// File to write, ending in .gif, .png or .svg
+    #[arg(long, value_name = "FILE")]
+    pub out: PathBuf,
+    /// Write over the file if it is there
+    #[arg(long)]
+    pub force: bool,
 }
 
 #[derive(Args, Debug)]

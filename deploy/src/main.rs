@@ -13,6 +13,7 @@ mod plot;
 mod player;
 mod processes;
 mod progress;
+mod render;
 mod report;
 mod shutdown;
 mod soak;
@@ -49,6 +50,7 @@ async fn run(cli: Cli) -> Result<ExitCode, Failure> {
         Command::Learner(options) => processes::learner(options, logs).await,
         Command::Actor(options) => processes::actor(options, logs).await,
         Command::Evaluate(options) => evaluate::run(&options),
+        Command::Render(options) => render::run(&options),
         Command::Ctl(options) => ctl::run(options).await,
         Command::Soak(options) => soak::run(options).await,
         Command::Bench(options) => bench::run(&options),

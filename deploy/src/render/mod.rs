@@ -1,0 +1,137 @@
+//! `rit render`: episodes as pictures. One part draws what an episode looks like on any [`canvas::Canvas`], the
+//! others put it into a file.
+
+mod canvas;
+mod gif;
+mod ink;
+mod layout;
+mod plot;
+mod png;
+mod raster;
+mod recording;
+mod svg;
+mod view;
+
+use crate::{cli::RenderOptions, failure::Failure, player::Player};
+use recording::{Film, Recording};
+use rit_learner::evaluation::Evaluator;
+use std::{
+    fs::Permissions,
+    io::{self, Write as _},
+    os::unix::fs::PermissionsExt as _,
+    path::Path,
+    process::ExitCode,
+};
+
+/// What a file's ending asks for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Format {
+    /// Step after step.
+    Gif,
+    /// A row of moments an episode.
+    Png,
+    /// A plot of each episode's course.
+    Svg,
+}
+
+impl Format {
+    fn of(path: &Path) -> Result<Self, Failure> {
+        let ending = path.extension().map(|ending| ending.to_string_lossy().to_lowercase());
+        match ending.as_deref() {
+            Some("gif") => Ok(Self::Gif),
+            Some("png") => Ok(Self::Png),
+            Some("svg") => Ok(Self::Svg),
+            _ => Err(Failure::input_message(format!(
+                "--out {}: a picture's name ends in .gif, .png or .svg",
+                path.display()
+            ))),
+        }
+    }
+}
+
+/// `rit render`.
+#[allow(clippy::print_stdout, reason = "what the command is for")]
+pub fn run(options: &RenderOptions) -> Result<ExitCode, Failure> {
+    let format = Format::of(&options.out)?;
+    if options.out.exists() && !options.force {
+        return Err(occupied(&options.out));
+    }
+    let film = record(options)?;
+    let bytes = match format {
+        Format::Gif => gif::encode(&film)?,
+        Format::Png => png::encode(&film)?,
+        Format::Svg => svg::encode(&film).into_bytes(),
+    };
+    write(&options.out, &bytes, options.force)?;
+    let returns: Vec<_> =
+        film.episodes.iter().map(|episode| format!("{:.2}", episode.episode.total_reward())).collect();
+    println!(
+        "{}: {} by {}, {} kB, return {}",
+        options.out.display(),
+        film.task,
+        film.policy,
+        bytes.len().div_ceil(1000),
+        returns.join(", ")
+    );
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Rolls the episodes and keeps what can be drawn of them.
+fn record(options: &RenderOptions) -> Result<Film, Failure> {
+    let mut player = Player::new(&options.play)?;
+    let task = player.config.environment.task_set.task(&options.task)?;
+    let seed = player.seed(options.seed);
+    let count = usize::from(options.episodes);
+    let mut scenes = vec![Vec::new(); count];
+    let episodes =
+        Evaluator::new(&player.config).watch(player.policy.as_mut(), task, count, seed, |episode, world| {
+            scenes[episode].extend(world.scene());
+        });
+    if scenes.iter().any(Vec::is_empty) {
+        return Err(Failure::input_message(format!(
+            "{task} is played on a table of rewards, where nothing has a place: there is nothing to draw; \
+             `rit evaluate` measures it"
+        )));
+    }
+    let pairs = scenes.into_iter().zip(episodes);
+    let episodes = pairs.map(|(scenes, episode)| Recording { scenes, episode }).collect();
+    Ok(Film { task, policy: player.name, episodes })
+}
+
+/// Whole or not at all: written beside its place and moved there.
+fn write(path: &Path, bytes: &[u8], force: bool) -> Result<(), Failure> {
+    let wrong = |error: io::Error| {
+        if error.kind() == io::ErrorKind::AlreadyExists {
+            occupied(path)
+        } else {
+            Failure::input_message(format!("--out {}: {error}", path.display()))
+        }
+    };
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let readable = Permissions::from_mode(0o666); // less what the umask takes
+    let mut partial = tempfile::Builder::new().permissions(readable).tempfile_in(folder).map_err(wrong)?;
+    partial.write_all(bytes).map_err(wrong)?;
+    // Not there when looked for, but meanwhile it may be.
+    let moved = if force { partial.persist(path) } else { partial.persist_noclobber(path) };
+    moved.map(drop).map_err(|error| wrong(error.error))
+}
+
+fn occupied(path: &Path) -> Failure {
+    Failure::input_message(format!("{} is there already; --force writes over it", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_ending_says_what_is_drawn() {
+        let format = |name: &str| Format::of(Path::new(name)).ok();
+        assert_eq!(format("a/b.gif"), Some(Format::Gif));
+        assert_eq!(format("b.PNG"), Some(Format::Png));
+        assert_eq!(format("b.c.svg"), Some(Format::Svg));
+        for name in ["gif", "a.jpeg", "a.gif/b", ".svg"] {
+            assert_eq!(format(name), None, "{name}");
+        }
+    }
+}
