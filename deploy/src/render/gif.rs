@@ -1,6 +1,7 @@
 //! Every step of every episode, one after the other, as an animated GIF.
 
 use super::{
+    ink,
     layout::{self, FRAME},
     raster::Raster,
     recording::{Film, Recording},
@@ -18,6 +19,8 @@ const END: u16 = 200;
 
 /// So many pictures after each other have about the same colours.
 const SAMPLED: usize = 4;
+/// Shades of each body's colour that every palette has.
+const SHADES: u8 = 16;
 /// Colours of a palette: one index is left for what has not changed.
 const COLOURS: usize = 255;
 /// That index.
@@ -42,6 +45,13 @@ pub fn encode(film: &Film) -> Result<Vec<u8>, Failure> {
     for shot in shots.iter().step_by(SAMPLED) {
         for run in draw(shot)?.chunk_by(|a, b| a == b) {
             *counts.entry(run[0]).or_insert(0) += run.len();
+        }
+    }
+    // Trails are thin, so their colours are rare; but grey ones would be wrong.
+    for kind in film.kinds() {
+        for shade in 1..=SHADES {
+            let ink = ink::body(kind).at(f32::from(shade) / f32::from(SHADES));
+            counts.insert(ink.over(ink::GROUND.rgb), usize::MAX);
         }
     }
     let mut palette = Palette::of(counts);
@@ -128,6 +138,7 @@ impl Palette {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::render::recording::tests::film;
 
     #[test]
     fn only_what_has_changed_is_written_again() {
@@ -138,6 +149,16 @@ mod tests {
         assert_eq!(*frame.buffer, [2, UNCHANGED, UNCHANGED, 3]);
         let nothing = changes(&before, &before, 4);
         assert_eq!((nothing.width, nothing.height, &*nothing.buffer), (1, 1, &[UNCHANGED][..]));
+    }
+
+    #[test]
+    fn a_fading_trail_keeps_its_colour() {
+        let film = film(0.2);
+        let bytes = encode(&film).unwrap();
+        let decoder = gif::DecodeOptions::new().read_info(&bytes[..]).unwrap();
+        let palette: Vec<_> = decoder.global_palette().unwrap().chunks_exact(3).collect();
+        // Half of (213, 94, 0) over white.
+        assert!(palette.contains(&&[234, 175, 128][..]), "{palette:?}");
     }
 
     #[test]

@@ -22,6 +22,16 @@ impl Ink {
     pub const fn at(self, opacity: f32) -> Self {
         Self { opacity, ..self }
     }
+
+    /// What is seen where it covers this colour.
+    pub fn over(self, below: [u8; 3]) -> [u8; 3] {
+        let mut seen = below;
+        for (seen, above) in seen.iter_mut().zip(self.rgb) {
+            let below = f32::from(*seen);
+            *seen = (below + (f32::from(above) - below) * self.opacity).round() as u8;
+        }
+        seen
+    }
 }
 
 /// Behind everything.

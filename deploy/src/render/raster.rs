@@ -68,13 +68,9 @@ impl Raster {
             return;
         }
         let Some(pixel) = self.pixels.pixels_mut().get_mut(y * width + x) else { return };
-        let cover = cover * ink.opacity;
-        let mixed = |below: u8, above: u8| {
-            (f32::from(below) + (f32::from(above) - f32::from(below)) * cover).round() as u8
-        };
-        let [red, green, blue] = ink.rgb;
-        let mixed = [mixed(pixel.red(), red), mixed(pixel.green(), green), mixed(pixel.blue(), blue)];
-        if let Some(colour) = PremultipliedColorU8::from_rgba(mixed[0], mixed[1], mixed[2], 255) {
+        let below = [pixel.red(), pixel.green(), pixel.blue()];
+        let [red, green, blue] = ink.at(cover * ink.opacity).over(below);
+        if let Some(colour) = PremultipliedColorU8::from_rgba(red, green, blue, 255) {
             *pixel = colour;
         }
     }
