@@ -6,8 +6,7 @@ use rit_config::RunDir;
 use rit_episode::RunSeed;
 use rit_learner::{
     checkpoint::{LATEST, WEIGHTS},
-    evaluation::{Evaluator, TaskResult},
-    metrics::by_task,
+    evaluation::{Evaluator, TaskResult, by_task},
     trainer::evaluation_seed,
     weights_file,
 };

@@ -3,9 +3,9 @@
 
 use crate::{
     checkpoint::{Loaded, Manifest, Progress, SnapshotMark, TrainingState},
-    evaluation::{Evaluator, TaskResult},
+    evaluation::{Evaluator, TaskResult, by_task, in_words},
     ledger::Terms,
-    metrics::{Line, MetricsFile, Recent, by_task},
+    metrics::{Follower, Line, MetricsFile, Recent},
     replay::Replay,
     weights::{Snapshot, WeightsBoard},
     weights_file,
@@ -191,6 +191,11 @@ impl Trainer {
         Ok((trainer, board))
     }
 
+    /// Somebody who reads what is measured.
+    pub fn metrics_follower(&self) -> Follower {
+        self.metrics.follower()
+    }
+
     /// Where the run begins.
     pub fn beginning(&self) -> Beginning {
         Beginning {
@@ -214,7 +219,7 @@ impl Trainer {
             self.board = Arc::new(WeightsBoard::new(oldest, self.config.algorithm.policy_lag));
         }
         snapshots.for_each(|snapshot| self.board.publish(snapshot));
-        self.recent.restore(manifest.recent);
+        self.recent.restore(manifest.recent, manifest.exploring);
         loaded.replay.into_iter().for_each(|episode| self.replay.insert(Arc::new(episode)));
         let named = |(task, result): (String, TaskResult)| TaskResult { task, ..result };
         self.standing = Standing {
@@ -275,7 +280,7 @@ impl Trainer {
         for episode in episodes {
             progress.env_steps += episode.steps() as u64;
             progress.episodes += 1;
-            self.recent.push(&episode);
+            self.recent.push(&episode, progress.updates);
             let episode = Arc::new(episode);
             // Without a writer there is nobody to write; checkpoints say so.
             let _ = self.writer.send(ToWrite::Episode(Arc::clone(&episode)));
@@ -310,9 +315,7 @@ impl Trainer {
                 losses: standing.losses.into(),
                 tasks: by_task(&standing.recent),
             };
-            self.metrics
-                .write(&line)
-                .map_err(|error| TrainError::Io { path: self.run_dir.metrics(), error })?;
+            self.measured(&line)?;
         }
         let mut over = after.env_steps >= self.config.training.t_max;
         if self.is_due(self.config.evaluation.every_env_steps) {
@@ -328,10 +331,14 @@ impl Trainer {
         let progress = self.standing.progress;
         let results = self.greedy(self.config.evaluation.episodes);
         let line = Line::Evaluation { progress, wall_s: self.metrics.wall_s(), tasks: by_task(&results) };
-        self.metrics.write(&line).map_err(|error| TrainError::Io { path: self.run_dir.metrics(), error })?;
+        self.measured(&line)?;
         tracing::info!(env_steps = progress.env_steps, results = %in_words(&results), "evaluated");
         self.standing.evaluation = Some((progress, results.clone()));
         Ok(results)
+    }
+
+    fn measured(&mut self, line: &Line) -> Result<(), TrainError> {
+        self.metrics.write(line).map_err(|error| TrainError::Io { path: self.run_dir.metrics(), error })
     }
 
     fn greedy(&self, episodes: usize) -> Vec<TaskResult> {
@@ -375,6 +382,7 @@ impl Trainer {
                 terms: self.terms.iter().copied().collect(),
                 snapshots: kept.iter().map(mark).collect(),
                 recent: self.recent.windows(),
+                exploring: self.recent.exploring().to_vec(),
                 metrics_len: self.metrics.len(),
                 wall_s: self.metrics.wall_s(),
                 evaluation,
@@ -398,7 +406,7 @@ impl Trainer {
             progress: self.standing.progress,
             wall_s: self.metrics.wall_s(),
             weights_digest,
-            evaluation: results.into_iter().map(|result| (result.task.clone(), result)).collect(),
+            evaluation: by_task(&results),
         };
         let path = self.run_dir.summary();
         let text = serde_json::to_vec_pretty(&summary).map_err(io::Error::from);
@@ -411,12 +419,4 @@ impl Trainer {
 /// The seed of a run's own evaluations, scheduled or asked for without one.
 pub fn evaluation_seed(config: &Config) -> RunSeed {
     config.seed.derive("evaluation", 0)
-}
-
-fn in_words(results: &[TaskResult]) -> String {
-    let words = results.iter().map(|result| match result.win_rate {
-        Some(win_rate) => format!("{} wins {win_rate:.2}", result.task),
-        None => format!("{} {:.1}", result.task, result.mean_return),
-    });
-    words.collect::<Vec<_>>().join(", ")
 }
