@@ -17,6 +17,7 @@ use crate::{
     evaluation::{Exploring, TaskResult},
     ledger::Terms,
     replay_log::{self, ReplayLogError, remedy},
+    tensorboard::Position,
     weights::Snapshot,
     weights_file::{self, WeightsFileError},
 };
@@ -90,6 +91,9 @@ pub struct Manifest {
     pub exploring: Vec<Exploring>,
     /// Length of `metrics.jsonl`, in bytes.
     pub metrics_len: u64,
+    /// How far TensorBoard's event files go.
+    #[serde(default)]
+    pub tensorboard: Position,
     /// Seconds the learner has run.
     pub wall_s: f64,
     /// The newest scheduled evaluation: task by task.
@@ -432,6 +436,7 @@ mod tests {
                     recent: vec![vec![(0.1 + 0.2, true)], vec![]],
                     exploring: vec![Exploring { episodes_total: 9, policy_lag: 1 }],
                     metrics_len: 77,
+                    tensorboard: Position { file: "events".into(), len: 55 },
                     wall_s: 1.5,
                     evaluation: None,
                     weights_digest: weights_file::digest(&params),

@@ -16,6 +16,7 @@ pub mod replay;
 pub mod replay_log;
 pub mod rollout_service;
 mod run;
+pub mod tensorboard;
 pub mod trainer;
 pub mod weights;
 pub mod weights_file;

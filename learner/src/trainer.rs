@@ -7,6 +7,7 @@ use crate::{
     ledger::Terms,
     metrics::{Follower, Line, MetricsFile, Recent},
     replay::Replay,
+    tensorboard::{EventFile, Position},
     weights::{Snapshot, WeightsBoard},
     weights_file,
     writer::{ToWrite, Written},
@@ -116,6 +117,7 @@ pub struct Trainer {
     board: Arc<WeightsBoard>,
     evaluator: Evaluator,
     metrics: MetricsFile,
+    tensorboard: EventFile,
     recent: Recent,
     standing: Standing,
     /// What the next batches are rolled with, in order.
@@ -144,7 +146,7 @@ impl Trainer {
     /// weights on. `news` must not wait.
     ///
     /// # Errors
-    /// When the metrics file or the update's threads cannot be had.
+    /// When the metrics files or the update's threads cannot be had.
     pub fn new(
         config: Config,
         run_dir: RunDir,
@@ -161,17 +163,13 @@ impl Trainer {
         let first_terms = Terms { weights_version: 0, epsilon: config.epsilon(0) };
         let task_set = config.environment.task_set;
         let tasks = task_set.tasks(Split::Training).iter().map(ToString::to_string).collect();
-        let (metrics_len, wall_s) = loaded
-            .as_ref()
-            .map_or((0, 0.0), |loaded| (loaded.state.manifest.metrics_len, loaded.state.manifest.wall_s));
-        let path = run_dir.metrics();
-        let metrics =
-            MetricsFile::open(&path, metrics_len, wall_s).map_err(|error| TrainError::Io { path, error })?;
+        let (metrics, tensorboard) = files(&run_dir, loaded.as_ref().map(|loaded| &loaded.state.manifest))?;
         let mut trainer = Self {
             replay: Replay::new(config.algorithm.buffer_size),
             board: Arc::new(WeightsBoard::new(first, lag)),
             evaluator: Evaluator::new(&config),
             metrics,
+            tensorboard,
             recent: Recent::new(tasks, task_set.has_wins()),
             standing: Standing::default(),
             terms: vec![first_terms; lag + 1].into(),
@@ -338,7 +336,10 @@ impl Trainer {
     }
 
     fn measured(&mut self, line: &Line) -> Result<(), TrainError> {
-        self.metrics.write(line).map_err(|error| TrainError::Io { path: self.run_dir.metrics(), error })
+        self.metrics.write(line).map_err(|error| TrainError::Io { path: self.run_dir.metrics(), error })?;
+        self.tensorboard
+            .write(line)
+            .map_err(|error| TrainError::Io { path: self.run_dir.tensorboard(), error })
     }
 
     fn greedy(&self, episodes: usize) -> Vec<TaskResult> {
@@ -384,6 +385,7 @@ impl Trainer {
                 recent: self.recent.windows(),
                 exploring: self.recent.exploring().to_vec(),
                 metrics_len: self.metrics.len(),
+                tensorboard: self.tensorboard.position().clone(),
                 wall_s: self.metrics.wall_s(),
                 evaluation,
                 weights_digest: weights_digest.clone(),
@@ -414,6 +416,20 @@ impl Trainer {
         written.map_err(|error| TrainError::Io { path, error })?;
         Ok(summary)
     }
+}
+
+/// The files that show how training goes: begun, or continued from a checkpoint.
+fn files(run_dir: &RunDir, manifest: Option<&Manifest>) -> Result<(MetricsFile, EventFile), TrainError> {
+    let (len, wall_s) = manifest.map_or((0, 0.0), |manifest| (manifest.metrics_len, manifest.wall_s));
+    let path = run_dir.metrics();
+    let metrics = MetricsFile::open(&path, len, wall_s).map_err(|error| TrainError::Io { path, error })?;
+    let (position, from) = manifest.map_or((Position::default(), 0), |manifest| {
+        (manifest.tensorboard.clone(), manifest.progress.env_steps + 1)
+    });
+    let path = run_dir.tensorboard();
+    let tensorboard =
+        EventFile::create(&path, &position, from).map_err(|error| TrainError::Io { path, error })?;
+    Ok((metrics, tensorboard))
 }
 
 /// The seed of a run's own evaluations, scheduled or asked for without one.
