@@ -16,9 +16,18 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         .message_attribute("rit.v1.Evaluation", SERIALIZE)
         .message_attribute("rit.v1.TaskResult", SERIALIZE)
         .message_attribute("rit.v1.CheckpointResponse", SERIALIZE)
+        .message_attribute("rit.v1.CheckpointsStatus", SERIALIZE)
+        .message_attribute("rit.v1.Happening", SERIALIZE)
+        .message_attribute("rit.v1.MetricsLine", SERIALIZE)
+        .message_attribute("rit.v1.Rates", SERIALIZE)
+        .message_attribute("rit.v1.Training", SERIALIZE)
+        // Evaluations have none.
+        .field_attribute("rit.v1.TaskResult.episodes_total", WHERE_KNOWN)
+        .field_attribute("rit.v1.TaskResult.policy_lag", WHERE_KNOWN)
         .field_attribute("rit.v1.RunStatus.state", "#[serde(serialize_with = \"crate::state_name\")]")
         .compile_fds(descriptors)?;
     Ok(())
 }
 
 const SERIALIZE: &str = "#[derive(serde::Serialize)]";
+const WHERE_KNOWN: &str = "#[serde(skip_serializing_if = \"Option::is_none\")]";

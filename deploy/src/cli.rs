@@ -305,6 +305,15 @@ pub enum CtlCommand {
     },
     /// Write a checkpoint now
     Checkpoint,
+    /// Print what has been measured, one line each; with --json one object each
+    Metrics {
+        /// Go on with what is measured from now on, until the run is over
+        #[arg(long)]
+        follow: bool,
+        /// Begin with the first line at or behind so many environment steps
+        #[arg(long, value_name = "STEPS", default_value_t = 0)]
+        from: u64,
+    },
     /// End the run: checkpoint, summary, farewell
     Stop,
 }

@@ -7,11 +7,17 @@ use crate::{
     report,
 };
 use rit_config::RunDir;
-use rit_proto::v1::{
-    CheckpointRequest, EvaluateRequest, Evaluation, PauseRequest, ResumeRequest, RunStatus, StatusRequest,
-    StopRequest,
+use rit_proto::{
+    transport::Client,
+    v1::{
+        CheckpointRequest, EvaluateRequest, Evaluation, MetricsRequest, PauseRequest, ResumeRequest,
+        RunStatus, StatusRequest, StopRequest, control_client::ControlClient, metrics_update::Update,
+    },
 };
-use std::process::ExitCode;
+use std::{
+    io::{self, Write as _},
+    process::ExitCode,
+};
 
 /// `rit ctl`.
 #[allow(clippy::print_stdout, reason = "what the command is for")]
@@ -36,9 +42,39 @@ pub async fn run(options: CtlOptions) -> Result<ExitCode, Failure> {
             let words = format!("{}\nweights digest {}\n", path.display(), written.weights_digest);
             if options.json { json(&written)? } else { words }
         }
+        CtlCommand::Metrics { follow, from } => {
+            metrics(
+                &mut control,
+                MetricsRequest { from_env_steps: from, follow, ..Default::default() },
+                options.json,
+            )
+            .await?;
+            return Ok(ExitCode::SUCCESS);
+        }
     };
     print!("{text}");
     Ok(ExitCode::SUCCESS)
+}
+
+/// Prints metrics as they come. Whoever reads them may stop reading.
+async fn metrics(
+    control: &mut ControlClient<Client>,
+    request: MetricsRequest,
+    as_json: bool,
+) -> Result<(), Failure> {
+    let mut updates = control.metrics(request).await?.into_inner();
+    while let Some(update) = updates.message().await? {
+        let Some(Update::Line(line)) = update.update else { continue };
+        let text = if as_json {
+            serde_json::to_string(&line).map_err(Failure::runtime)?
+        } else {
+            report::line(&line)
+        };
+        if writeln!(io::stdout(), "{text}").is_err() {
+            return Ok(());
+        }
+    }
+    Ok(())
 }
 
 fn json(message: &impl serde::Serialize) -> Result<String, Failure> {

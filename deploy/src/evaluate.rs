@@ -1,10 +1,7 @@
 //! `rit evaluate`: greedy episodes with a run's newest checkpoint or a script, in this process.
 
 use crate::{cli::EvaluateOptions, failure::Failure, player::Player, report};
-use rit_learner::{
-    evaluation::{Evaluator, TaskResult},
-    metrics::by_task,
-};
+use rit_learner::evaluation::{Evaluator, TaskResult, by_task};
 use std::process::ExitCode;
 
 /// `rit evaluate`.

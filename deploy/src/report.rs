@@ -1,13 +1,13 @@
 //! Results as people read them.
 
-use rit_proto::v1::TaskResult;
+use rit_proto::v1::{MetricsLine, TaskResult};
 use std::fmt::Write as _;
 
 /// One line a task: name, mean return, win rate where there is one.
 pub fn table(results: &[TaskResult]) -> String {
     let width = results.iter().map(|result| result.task.len()).max().unwrap_or(0).max("task".len());
     let mut text = format!("{:width$}  episodes  mean return  win rate\n", "task");
-    for TaskResult { task, episodes, mean_return, win_rate } in results {
+    for TaskResult { task, episodes, mean_return, win_rate, .. } in results {
         let win_rate = win_rate.map_or_else(|| "-".to_owned(), |rate| format!("{rate:.3}"));
         // Writing to a String does not fail.
         let _ = writeln!(text, "{task:width$}  {episodes:8}  {mean_return:11.2}  {win_rate:>8}");
@@ -28,6 +28,7 @@ pub fn mean(results: &[TaskResult]) -> Option<TaskResult> {
         episodes: results.iter().map(|result| result.episodes).sum(),
         mean_return: results.iter().map(|result| result.mean_return).sum::<f64>() / count,
         win_rate: wins.map(|wins| wins / count),
+        ..TaskResult::default()
     })
 }
 
@@ -43,6 +44,27 @@ pub fn in_words(results: &[TaskResult]) -> Option<String> {
         Some(wins) => format!("return {mean:.1}, win rate {:.2}", wins / count),
         None => format!("return {mean:.1}"),
     })
+}
+
+/// A line of metrics in words.
+pub fn line(line: &MetricsLine) -> String {
+    let mut parts =
+        vec![format!("{} steps", grouped(line.env_steps)), format!("{} updates", grouped(line.updates))];
+    parts.extend(in_words(&line.tasks).map(|words| match line.training {
+        Some(_) => words,
+        None => format!("greedy: {words}"),
+    }));
+    if let Some(training) = &line.training {
+        parts.push(format!(
+            "TD {:.4}, contrastive {:.4}, gradient norm {:.3}, Q {:.2}, epsilon {:.3}",
+            training.td_loss,
+            training.contrastive_loss,
+            training.grad_norm,
+            training.q_total_mean,
+            training.epsilon
+        ));
+    }
+    parts.join(" · ")
 }
 
 /// A number with thin groups of three digits.
@@ -88,6 +110,7 @@ mod tests {
             episodes: 32,
             mean_return: -12.345,
             win_rate,
+            ..TaskResult::default()
         };
         let results = [result("game-1", Some(1.0)), result("long-name", None)];
         let expected = "task       episodes  mean return  win rate\n\
@@ -105,6 +128,7 @@ mod tests {
             episodes,
             mean_return,
             win_rate,
+            ..TaskResult::default()
         };
         let mixed = mean(&[result(10, 1.0, Some(0.5)), result(30, 4.0, Some(1.0))]).unwrap();
         assert_eq!((mixed.episodes, mixed.mean_return, mixed.win_rate), (40, 2.5, Some(0.75)));

@@ -335,5 +335,6 @@ fn task_result((task, result): (&String, &serde_json::Value)) -> TaskResult {
         episodes: result["episodes"].as_u64().unwrap_or_default(),
         mean_return: result["mean_return"].as_f64().unwrap_or_default(),
         win_rate: result["win_rate"].as_f64(),
+        ..TaskResult::default()
     }
 }

@@ -14,9 +14,10 @@
 //! then renamed there, so it is whole or not there. `checkpoints/latest` is a link to the newest.
 
 use crate::{
-    evaluation::TaskResult,
+    evaluation::{Exploring, TaskResult},
     ledger::Terms,
     replay_log::{self, ReplayLogError, remedy},
+    tensorboard::Position,
     weights::Snapshot,
     weights_file::{self, WeightsFileError},
 };
@@ -85,8 +86,14 @@ pub struct Manifest {
     pub snapshots: Vec<SnapshotMark>,
     /// (return, won) of exploring episodes of late, by task.
     pub recent: Vec<Vec<(f64, bool)>>,
+    /// Exploring episodes on the whole, by task.
+    #[serde(default)]
+    pub exploring: Vec<Exploring>,
     /// Length of `metrics.jsonl`, in bytes.
     pub metrics_len: u64,
+    /// How far TensorBoard's event files go.
+    #[serde(default)]
+    pub tensorboard: Position,
     /// Seconds the learner has run.
     pub wall_s: f64,
     /// The newest scheduled evaluation: task by task.
@@ -427,7 +434,9 @@ mod tests {
                         .map(|(version, env_steps)| SnapshotMark { version, env_steps })
                         .to_vec(),
                     recent: vec![vec![(0.1 + 0.2, true)], vec![]],
+                    exploring: vec![Exploring { episodes_total: 9, policy_lag: 1 }],
                     metrics_len: 77,
+                    tensorboard: Position { file: "events".into(), len: 55 },
                     wall_s: 1.5,
                     evaluation: None,
                     weights_digest: weights_file::digest(&params),

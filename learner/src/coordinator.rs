@@ -3,11 +3,15 @@
 //! One task owns the ledger and the list of actors; everybody else sends it [`Event`]s. It never waits for
 //! the trainer or for an actor, so a slow one holds up nobody.
 
+mod status;
+
 use crate::{
-    evaluation::TaskResult,
+    evaluation::in_words,
+    gauges::{Happenings, RateWindow, Stopwatch},
     ledger::{ActorId, Lease, Ledger, Reason, Terms},
     receive::Fence,
     trainer::{Beginning, Checkpointed, News, Standing, Work},
+    writer::CheckpointEnded,
 };
 use rit_config::Config;
 use rit_episode::{Episode, wire};
@@ -23,7 +27,7 @@ use tonic::Status;
 /// How long the end of a run waits for actors to go.
 const FAREWELL_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// From one look for hung actors to the next.
+/// From one look for hung actors, at rates and at the ledger's balance to the next.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
 
 /// Messages an actor's stream may hold: far more than one lease at a time can fill.
@@ -54,6 +58,8 @@ pub enum Event {
     Gone(ActorId),
     /// The trainer speaks.
     News(News),
+    /// The writer is done with a checkpoint.
+    CheckpointEnded(CheckpointEnded),
     /// The trainer or the receiving thread is done, well or not: nothing more can happen.
     Over,
     /// Somebody asks or wants something.
@@ -91,6 +97,15 @@ struct Actor {
     heard: Instant,
     /// Silent for too long: its episodes went to another.
     hung: bool,
+    /// Runs while the ledger hands nothing out to it.
+    waiting: Stopwatch,
+}
+
+impl Actor {
+    /// Whether it could roll and has nothing to.
+    fn is_idle(&self, id: ActorId, ledger: &Ledger) -> bool {
+        !self.leaving && !self.hung && ledger.outstanding_with(id).next().is_none()
+    }
 }
 
 /// The coordinator.
@@ -103,6 +118,17 @@ pub struct Coordinator {
     standing: Standing,
     epsilon: f32,
     frames_refused: BTreeMap<&'static str, u64>,
+    /// Frames that were read, refused ones too.
+    frames: u64,
+    /// Batches that training was given and has not done.
+    batches_in_training: u64,
+    /// Runs while training has no batch.
+    learner_waiting: Stopwatch,
+    rates: RateWindow,
+    checkpoints: v1::CheckpointsStatus,
+    happenings: Happenings,
+    /// How often the ledger was found not to balance.
+    imbalances: u64,
     started: Instant,
     work: mpsc::Sender<Work>,
     fences: mpsc::Sender<Fence>,
@@ -117,6 +143,7 @@ impl Coordinator {
         fences: mpsc::Sender<Fence>,
     ) -> Self {
         let Beginning { batches, terms, standing } = beginning;
+        let started = Instant::now();
         Self {
             epsilon: config.epsilon(standing.progress.env_steps),
             standing,
@@ -125,7 +152,14 @@ impl Coordinator {
             next_actor: 0,
             state: v1::RunState::Running,
             frames_refused: BTreeMap::new(),
-            started: Instant::now(),
+            frames: 0,
+            batches_in_training: 0,
+            learner_waiting: Stopwatch::default(),
+            rates: RateWindow::default(),
+            checkpoints: v1::CheckpointsStatus::default(),
+            happenings: Happenings::new(started),
+            imbalances: 0,
+            started,
             config,
             work,
             fences,
@@ -141,20 +175,55 @@ impl Coordinator {
                     None | Some(Event::Over) => break,
                     Some(event) => self.handle(event),
                 },
-                _ = looks.tick() => self.look_for_hung_actors(),
+                _ = looks.tick() => {
+                    self.look_for_hung_actors();
+                    self.rates.note(Instant::now(), self.standing.progress);
+                    self.check_balance();
+                }
             }
+            self.time_waits();
         }
         self.state = v1::RunState::Stopping;
         self.part_with_actors(&mut events).await;
+        self.check_balance();
+        tracing::info!(counts = ?self.ledger.counts(), "the ledger is closed");
+    }
+
+    /// Who waits for whom. Nobody does while the run is paused or ending.
+    fn time_waits(&mut self) {
+        let (now, running) = (Instant::now(), self.state == v1::RunState::Running);
+        self.learner_waiting.set(running && self.batches_in_training == 0, now);
+        for (&id, actor) in &mut self.actors {
+            actor.waiting.set(running && actor.is_idle(id, &self.ledger), now);
+        }
+    }
+
+    fn check_balance(&mut self) {
         let counts = self.ledger.counts();
-        tracing::info!(?counts, "the ledger is closed");
-        debug_assert!(counts.balance());
+        if counts.balance() {
+            return;
+        }
+        if self.imbalances == 0 {
+            tracing::error!(?counts, "the ledger does not balance: a fault of the program");
+        }
+        self.imbalances += 1;
+        debug_assert!(counts.balance(), "{counts:?}");
+    }
+
+    fn happened(&mut self, what: String) {
+        self.happenings.note(self.standing.progress.env_steps, what);
     }
 
     fn handle(&mut self, event: Event) {
         match event {
-            Event::Episode(actor, episode) => self.insert(actor, *episode),
-            Event::FrameRefused(reason) => *self.frames_refused.entry(reason).or_default() += 1,
+            Event::Episode(actor, episode) => {
+                self.frames += 1;
+                self.insert(actor, *episode);
+            }
+            Event::FrameRefused(reason) => {
+                self.frames += 1;
+                *self.frames_refused.entry(reason).or_default() += 1;
+            }
             Event::Join(hello, to, answer) => {
                 let joined = self.join(hello, to);
                 let id = joined.as_ref().ok().copied();
@@ -179,6 +248,7 @@ impl Coordinator {
                 if self.has_outstanding(actor, lease) {
                     let missing = self.ledger.take_back(actor, Reason::NotArrived);
                     tracing::warn!(actor, missing, "episodes did not arrive and are handed out again");
+                    self.happened(format!("{missing} episodes did not arrive and are handed out again"));
                     self.hand_out();
                 }
             }
@@ -194,13 +264,33 @@ impl Coordinator {
             Event::News(News::Trained(terms, standing)) => {
                 self.ledger.open(terms);
                 self.epsilon = terms.epsilon;
+                self.batches_in_training = self.batches_in_training.saturating_sub(1);
+                let evaluated_at = |standing: &Standing| standing.evaluation.as_ref().map(|(at, _)| *at);
+                let evaluated = evaluated_at(&standing) != evaluated_at(&self.standing);
                 self.standing = standing;
+                if evaluated && let Some((_, results)) = &self.standing.evaluation {
+                    self.happened(format!("evaluated: {}", in_words(results)));
+                }
                 self.hand_out();
             }
             Event::News(News::Ending) => self.state = v1::RunState::Stopping,
+            Event::CheckpointEnded(ended) => self.checkpoint_ended(ended),
             Event::Over => {}
             Event::Control(control) => self.control(control),
         }
+    }
+
+    fn checkpoint_ended(&mut self, CheckpointEnded { env_steps, duration, written }: CheckpointEnded) {
+        if !written {
+            self.checkpoints.failed += 1;
+            self.happened(format!("the checkpoint at {env_steps} steps was not written"));
+            return;
+        }
+        let checkpoints = &mut self.checkpoints;
+        (checkpoints.written, checkpoints.env_steps) = (checkpoints.written + 1, env_steps);
+        checkpoints.last_s = duration.as_secs_f64();
+        checkpoints.total_s += checkpoints.last_s;
+        self.happened(format!("wrote the checkpoint at {env_steps} steps in {} ms", duration.as_millis()));
     }
 
     fn control(&mut self, control: Control) {
@@ -213,6 +303,7 @@ impl Coordinator {
                 if self.state == v1::RunState::Running {
                     self.state = v1::RunState::Paused;
                     tracing::info!("paused");
+                    self.happened("paused".into());
                 }
                 let _ = answer.send(self.status());
             }
@@ -220,6 +311,7 @@ impl Coordinator {
                 if self.state == v1::RunState::Paused {
                     self.state = v1::RunState::Running;
                     tracing::info!("resumed");
+                    self.happened("resumed".into());
                     self.hand_out();
                 }
                 let _ = answer.send(self.status());
@@ -229,6 +321,7 @@ impl Coordinator {
             }
             Control::Stop(answer) => {
                 tracing::info!("asked to stop");
+                self.happened("asked to stop".into());
                 self.state = v1::RunState::Stopping;
                 let _ = self.work.send(Work::Stop);
                 let _ = answer.send(self.status());
@@ -257,6 +350,7 @@ impl Coordinator {
         let id = self.next_actor;
         self.next_actor += 1;
         tracing::info!(name, pid, actor = id, "an actor joined");
+        self.happened(format!("{name} joined"));
         let capacity = capacity.clamp(1, 4096) as usize;
         self.actors.insert(
             id,
@@ -270,6 +364,7 @@ impl Coordinator {
                 leaving: false,
                 heard: Instant::now(),
                 hung: false,
+                waiting: Stopwatch::default(),
             },
         );
         Ok(id)
@@ -280,6 +375,8 @@ impl Coordinator {
         actor.heard = Instant::now();
         if std::mem::take(&mut actor.hung) {
             tracing::info!(name = actor.name, actor = id, "an actor that hung is back");
+            let what = format!("{} is back", actor.name);
+            self.happened(what);
             self.hand_out();
         }
     }
@@ -294,6 +391,8 @@ impl Coordinator {
                 actor.hung = true;
                 let silent_s = actor.heard.elapsed().as_secs_f64();
                 tracing::warn!(name = actor.name, actor = id, had, silent_s, "an actor hangs");
+                let what = format!("{} hangs; its {had} episodes go to another", actor.name);
+                self.happened(what);
             }
             self.hand_out();
         }
@@ -303,6 +402,7 @@ impl Coordinator {
         let Some(actor) = self.actors.remove(&id) else { return };
         let had = self.ledger.take_back(id, Reason::ActorGone);
         tracing::info!(name = actor.name, actor = id, had, "an actor has gone");
+        self.happened(format!("{} has gone; it had {had} episodes", actor.name));
         self.hand_out();
     }
 
@@ -319,6 +419,7 @@ impl Coordinator {
         while let Some(batch) = self.ledger.take_batch() {
             // Without a trainer the run is over, which `Over` says.
             let _ = self.work.send(Work::Batch(batch));
+            self.batches_in_training += 1;
         }
         self.part_if_done(id);
         self.hand_out();
@@ -331,8 +432,7 @@ impl Coordinator {
         }
         let share = self.config.algorithm.n_rollout_threads.div_ceil(self.actors.len().max(1));
         let idle = |(id, actor): (&ActorId, &Actor)| {
-            let idle = !actor.leaving && !actor.hung && self.ledger.outstanding_with(*id).next().is_none();
-            idle.then_some((*id, actor.capacity.min(share)))
+            actor.is_idle(*id, &self.ledger).then_some((*id, actor.capacity.min(share)))
         };
         for (id, limit) in self.actors.iter().filter_map(idle).collect::<Vec<_>>() {
             let Some(Lease { episodes, terms }) = self.ledger.lease(id, limit) else { return };
@@ -387,56 +487,6 @@ impl Coordinator {
                     return;
                 }
             }
-        }
-    }
-
-    fn status(&self) -> v1::RunStatus {
-        let Standing { progress, losses, recent, evaluation, replay_episodes } = &self.standing;
-        let counts = self.ledger.counts();
-        let messages = |results: &[TaskResult]| results.iter().map(TaskResult::to_message).collect();
-        let rejected = counts.rejected.iter().map(|(reason, &count)| (reason.name().to_owned(), count));
-        v1::RunStatus {
-            state: self.state.into(),
-            env_steps: progress.env_steps,
-            env_steps_max: self.config.training.t_max,
-            episodes: progress.episodes,
-            updates: progress.updates,
-            epsilon: self.epsilon.into(),
-            wall_s: self.started.elapsed().as_secs_f64(),
-            td_loss: losses.td_loss,
-            contrastive_loss: losses.contrastive_loss,
-            grad_norm: losses.grad_norm,
-            recent: messages(recent),
-            evaluation: evaluation.as_ref().map(|(progress, results)| v1::Evaluation {
-                env_steps: progress.env_steps,
-                weights_version: progress.updates,
-                tasks: messages(results),
-            }),
-            actors: self.actors.iter().map(|(&id, actor)| self.actor_status(id, actor)).collect(),
-            ledger: Some(v1::LedgerStatus {
-                handed_out: counts.handed_out,
-                inserted: counts.inserted,
-                outstanding: counts.outstanding,
-                rejected: rejected.collect(),
-                frames_refused: self
-                    .frames_refused
-                    .iter()
-                    .map(|(&name, &count)| (name.into(), count))
-                    .collect(),
-            }),
-            replay_episodes: *replay_episodes as u64,
-            pid: std::process::id(),
-        }
-    }
-
-    fn actor_status(&self, id: ActorId, actor: &Actor) -> v1::ActorStatus {
-        v1::ActorStatus {
-            name: actor.name.clone(),
-            pid: actor.pid,
-            episodes: actor.episodes,
-            outstanding: self.ledger.outstanding_with(id).count() as u64,
-            silent_s: actor.heard.elapsed().as_secs_f64(),
-            hung: actor.hung,
         }
     }
 }

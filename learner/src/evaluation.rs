@@ -8,6 +8,7 @@ use rit_env::{
 use rit_episode::{Episode, Policy, RunSeed};
 use rit_proto::v1;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// Episodes rolled side by side.
 const SIDE_BY_SIDE: usize = 32;
@@ -24,6 +25,18 @@ pub struct TaskResult {
     pub mean_return: f64,
     /// Share of episodes won, where the task knows winning.
     pub win_rate: Option<f64>,
+    /// Of exploring episodes: how the task goes on the whole.
+    #[serde(flatten)]
+    pub exploring: Option<Exploring>,
+}
+
+/// How the exploring episodes of a task came in.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Exploring {
+    /// All that were collected.
+    pub episodes_total: u64,
+    /// Weights version of the learner minus that of the newest one, when it entered replay.
+    pub policy_lag: u64,
 }
 
 impl TaskResult {
@@ -34,8 +47,24 @@ impl TaskResult {
             episodes: self.episodes,
             mean_return: self.mean_return,
             win_rate: self.win_rate,
+            episodes_total: self.exploring.map(|exploring| exploring.episodes_total),
+            policy_lag: self.exploring.map(|exploring| exploring.policy_lag),
         }
     }
+}
+
+/// Results by task, as they stand in files.
+pub fn by_task(results: &[TaskResult]) -> BTreeMap<String, TaskResult> {
+    results.iter().map(|result| (result.task.clone(), result.clone())).collect()
+}
+
+/// Results in a line of words.
+pub fn in_words(results: &[TaskResult]) -> String {
+    let words = results.iter().map(|result| match result.win_rate {
+        Some(win_rate) => format!("{} wins {win_rate:.2}", result.task),
+        None => format!("{} {:.1}", result.task, result.mean_return),
+    });
+    words.collect::<Vec<_>>().join(", ")
 }
 
 /// What all evaluations of a run share.
@@ -125,6 +154,7 @@ impl Evaluator {
             episodes: episodes as u64,
             mean_return: share(total),
             win_rate: self.task_set.has_wins().then(|| share(won as f64)),
+            exploring: None,
         }
     }
 }

@@ -1,19 +1,28 @@
-//! What is measured while training: `metrics.jsonl`, one object a line, and how episodes went of late.
+//! What is measured while training: `metrics.jsonl`, one object a line, whoever follows it, and how episodes went
+//! of late.
 
-use crate::{checkpoint::Progress, evaluation::TaskResult};
+use crate::{
+    checkpoint::Progress,
+    evaluation::{Exploring, TaskResult},
+};
 use rit_algo::Losses;
 use rit_episode::Episode;
-use serde::Serialize;
+use rit_proto::v1;
+use serde::{Deserialize, Serialize};
 use std::{
     collections::{BTreeMap, VecDeque},
     fs::{File, OpenOptions},
-    io::{self, Seek as _, SeekFrom, Write as _},
-    path::Path,
+    io::{self, Read as _, Seek as _, SeekFrom, Write as _},
+    path::{Path, PathBuf},
     time::Instant,
 };
+use tokio::sync::watch;
 
 /// Episodes of each task that count as of late.
 const RECENT: usize = 100;
+
+/// Bytes that whoever follows the file reads at a time: far more than a line has.
+const CHUNK: u64 = 1 << 20;
 
 /// How exploring episodes of each training task went of late.
 #[derive(Debug)]
@@ -22,13 +31,15 @@ pub struct Recent {
     has_wins: bool,
     /// (return, won), the newest last, by task.
     episodes: Vec<VecDeque<(f64, bool)>>,
+    exploring: Vec<Exploring>,
 }
 
 impl Recent {
     /// Of tasks with these names, which know winning or not.
     pub fn new(tasks: Vec<String>, has_wins: bool) -> Self {
         let episodes = tasks.iter().map(|_| VecDeque::with_capacity(RECENT)).collect();
-        Self { tasks, has_wins, episodes }
+        let exploring = vec![Exploring::default(); tasks.len()];
+        Self { tasks, has_wins, episodes, exploring }
     }
 
     /// What is counted: (return, won), the newest last, by task.
@@ -36,27 +47,39 @@ impl Recent {
         self.episodes.iter().map(|recent| recent.iter().copied().collect()).collect()
     }
 
+    /// How each task goes on the whole.
+    pub fn exploring(&self) -> &[Exploring] {
+        &self.exploring
+    }
+
     /// Goes on with what was counted before.
-    pub fn restore(&mut self, windows: Vec<Vec<(f64, bool)>>) {
+    pub fn restore(&mut self, windows: Vec<Vec<(f64, bool)>>, exploring: Vec<Exploring>) {
         for (recent, window) in self.episodes.iter_mut().zip(windows) {
             *recent = window.into();
         }
+        for (now, before) in self.exploring.iter_mut().zip(exploring) {
+            *now = before;
+        }
     }
 
-    /// Counts an episode.
-    pub fn push(&mut self, episode: &Episode) {
+    /// Counts an episode that enters replay after so many updates.
+    pub fn push(&mut self, episode: &Episode, updates: u64) {
         let Some(recent) = self.episodes.get_mut(episode.task) else { return };
         if recent.len() == RECENT {
             recent.pop_front();
         }
         recent.push_back((episode.total_reward(), episode.won));
+        let exploring = &mut self.exploring[episode.task];
+        exploring.episodes_total += 1;
+        exploring.policy_lag = updates.saturating_sub(episode.weights_version);
     }
 
     /// Means by task, of those that had an episode.
     pub fn results(&self) -> Vec<TaskResult> {
-        let tasks = self.tasks.iter().zip(&self.episodes).filter(|(_, recent)| !recent.is_empty());
+        let tasks = self.tasks.iter().zip(&self.episodes).zip(&self.exploring);
         tasks
-            .map(|(task, recent)| {
+            .filter(|((_, recent), _)| !recent.is_empty())
+            .map(|((task, recent), exploring)| {
                 let count = recent.len() as f64;
                 let won = recent.iter().filter(|(_, won)| *won).count() as f64;
                 TaskResult {
@@ -64,27 +87,23 @@ impl Recent {
                     episodes: recent.len() as u64,
                     mean_return: recent.iter().map(|(total, _)| total).sum::<f64>() / count,
                     win_rate: self.has_wins.then_some(won / count),
+                    exploring: Some(*exploring),
                 }
             })
             .collect()
     }
 }
 
-/// Results by task, as they stand in metrics and in the summary.
-pub fn by_task(results: &[TaskResult]) -> BTreeMap<&str, &TaskResult> {
-    results.iter().map(|result| (result.task.as_str(), result)).collect()
-}
-
 /// One line of `metrics.jsonl`.
-#[derive(Debug, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
-pub enum Line<'a> {
+pub enum Line {
     /// How training goes.
     Training {
         /// How far it has come.
         #[serde(flatten)]
         progress: Progress,
-        /// Seconds since the learner started.
+        /// Seconds that learners have run.
         wall_s: f64,
         /// ε of the episodes handed out now.
         epsilon: f64,
@@ -92,28 +111,67 @@ pub enum Line<'a> {
         #[serde(flatten)]
         losses: LossLine,
         /// Exploring episodes of late.
-        tasks: BTreeMap<&'a str, &'a TaskResult>,
+        tasks: BTreeMap<String, TaskResult>,
     },
     /// A greedy evaluation.
     Evaluation {
         /// How far training had come.
         #[serde(flatten)]
         progress: Progress,
-        /// Seconds since the learner started.
+        /// Seconds that learners have run.
         wall_s: f64,
         /// Its results.
-        tasks: BTreeMap<&'a str, &'a TaskResult>,
+        tasks: BTreeMap<String, TaskResult>,
     },
 }
 
+impl Line {
+    /// How far training had come.
+    pub fn progress(&self) -> Progress {
+        match self {
+            Self::Training { progress, .. } | Self::Evaluation { progress, .. } => *progress,
+        }
+    }
+
+    /// As a message.
+    pub fn to_message(&self) -> v1::MetricsLine {
+        let (Self::Training { progress, wall_s, tasks, .. } | Self::Evaluation { progress, wall_s, tasks }) =
+            self;
+        let named = |(task, result): (&String, &TaskResult)| v1::TaskResult {
+            task: task.clone(),
+            ..result.to_message()
+        };
+        let training = match self {
+            Self::Training { epsilon, losses, .. } => Some(v1::Training {
+                epsilon: *epsilon,
+                td_loss: losses.td_loss,
+                contrastive_loss: losses.contrastive_loss,
+                grad_norm: losses.grad_norm,
+                q_total_mean: losses.q_total_mean,
+                target_mean: losses.target_mean,
+            }),
+            Self::Evaluation { .. } => None,
+        };
+        v1::MetricsLine {
+            env_steps: progress.env_steps,
+            episodes: progress.episodes,
+            updates: progress.updates,
+            wall_s: *wall_s,
+            tasks: tasks.iter().map(named).collect(),
+            training,
+        }
+    }
+}
+
 /// Losses as they stand in a line.
-#[derive(Clone, Copy, Debug, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[allow(missing_docs, reason = "as in Losses")]
 pub struct LossLine {
-    td_loss: f64,
-    contrastive_loss: f64,
-    grad_norm: f64,
-    q_total_mean: f64,
-    target_mean: f64,
+    pub td_loss: f64,
+    pub contrastive_loss: f64,
+    pub grad_norm: f64,
+    pub q_total_mean: f64,
+    pub target_mean: f64,
 }
 
 impl From<Losses> for LossLine {
@@ -126,8 +184,10 @@ impl From<Losses> for LossLine {
 /// Writes `metrics.jsonl`.
 #[derive(Debug)]
 pub struct MetricsFile {
+    path: PathBuf,
     file: File,
-    len: u64,
+    /// Bytes written, as whoever follows the file knows them.
+    len: watch::Sender<u64>,
     started: Instant,
     /// Seconds that learners before this one ran.
     before_s: f64,
@@ -142,8 +202,8 @@ impl MetricsFile {
     pub fn open(path: &Path, len: u64, before_s: f64) -> io::Result<Self> {
         let mut file = OpenOptions::new().create(true).truncate(false).write(true).open(path)?;
         file.set_len(len.min(file.metadata()?.len()))?;
-        let len = file.seek(SeekFrom::End(0))?;
-        Ok(Self { file, len, started: Instant::now(), before_s })
+        let len = watch::Sender::new(file.seek(SeekFrom::End(0))?);
+        Ok(Self { path: path.to_owned(), file, len, started: Instant::now(), before_s })
     }
 
     /// Seconds that learners have run, this one and those before.
@@ -153,12 +213,17 @@ impl MetricsFile {
 
     /// Bytes written.
     pub fn len(&self) -> u64 {
-        self.len
+        *self.len.borrow()
     }
 
     /// Whether nothing is written yet.
     pub fn is_empty(&self) -> bool {
-        self.len == 0
+        self.len() == 0
+    }
+
+    /// Somebody who reads all its lines, from the first.
+    pub fn follower(&self) -> Follower {
+        Follower { path: self.path.clone(), at: 0, len: self.len.subscribe() }
     }
 
     /// Writes a line at once, so that whoever follows the file sees it whole. A failed write leaves the file as
@@ -166,16 +231,49 @@ impl MetricsFile {
     ///
     /// # Errors
     /// When the disk refuses.
-    pub fn write(&mut self, line: &Line<'_>) -> io::Result<()> {
+    pub fn write(&mut self, line: &Line) -> io::Result<()> {
         let mut text = serde_json::to_vec(line)?;
         text.push(b'\n');
         if let Err(error) = self.file.write_all(&text) {
-            self.file.set_len(self.len)?;
-            self.file.seek(SeekFrom::Start(self.len))?;
+            self.file.set_len(self.len())?;
+            self.file.seek(SeekFrom::Start(self.len()))?;
             return Err(error);
         }
-        self.len += text.len() as u64;
+        self.len.send_modify(|len| *len += text.len() as u64);
         Ok(())
+    }
+}
+
+/// Reads `metrics.jsonl` while it is written. However slow it is, it holds up nobody and misses nothing: what it
+/// has not read lies in the file.
+#[derive(Clone, Debug)]
+pub struct Follower {
+    path: PathBuf,
+    /// Where it reads on, in bytes.
+    at: u64,
+    len: watch::Receiver<u64>,
+}
+
+impl Follower {
+    /// The next lines, some of those there are; none when it has read them all.
+    ///
+    /// # Errors
+    /// When the file cannot be read or holds something else.
+    pub fn read(&mut self) -> io::Result<Vec<Line>> {
+        let len = *self.len.borrow_and_update();
+        let mut file = File::open(&self.path)?;
+        file.seek(SeekFrom::Start(self.at))?;
+        let mut text = Vec::new();
+        file.take(CHUNK.min(len.saturating_sub(self.at))).read_to_end(&mut text)?;
+        let whole = text.iter().rposition(|&byte| byte == b'\n').map_or(0, |at| at + 1);
+        self.at += whole as u64;
+        let lines = text[..whole].split(|&byte| byte == b'\n').filter(|line| !line.is_empty());
+        lines.map(|line| serde_json::from_slice(line).map_err(io::Error::from)).collect()
+    }
+
+    /// Waits for further lines; `false` when there will be none, since nobody writes any more.
+    pub async fn more(&mut self) -> bool {
+        self.len.changed().await.is_ok()
     }
 }
 
@@ -184,14 +282,22 @@ mod tests {
     use super::*;
     use std::fs;
 
+    fn line(env_steps: u64) -> Line {
+        let exploring = Some(Exploring { episodes_total: 7, policy_lag: 1 });
+        let result =
+            TaskResult { task: String::new(), episodes: 5, mean_return: 0.1, win_rate: None, exploring };
+        Line::Training {
+            progress: Progress { env_steps, episodes: 3, updates: 2 },
+            wall_s: 0.5,
+            epsilon: 0.1 + 0.2,
+            losses: Losses { td_loss: 1e-9, target_mean: -3.0, ..Losses::default() }.into(),
+            tasks: BTreeMap::from([("game-1".to_owned(), result)]),
+        }
+    }
+
     #[test]
     fn a_resumed_file_forgets_what_the_dead_learner_wrote_last() {
         let file = tempfile::NamedTempFile::new().unwrap();
-        let line = |env_steps| Line::Evaluation {
-            progress: Progress { env_steps, ..Progress::default() },
-            wall_s: 0.0,
-            tasks: BTreeMap::new(),
-        };
         let mut first = MetricsFile::open(file.path(), 0, 0.0).unwrap();
         first.write(&line(1)).unwrap();
         let at_checkpoint = first.len();
@@ -199,10 +305,48 @@ mod tests {
         let mut second = MetricsFile::open(file.path(), at_checkpoint, 100.0).unwrap();
         second.write(&line(3)).unwrap();
         assert!(second.wall_s() >= 100.0);
-        let text = fs::read_to_string(file.path()).unwrap();
-        let steps: Vec<_> =
-            text.lines().map(|line| line.contains("\"env_steps\":1") || line.contains(":3")).collect();
-        assert_eq!(steps, [true, true]);
-        assert_eq!(second.len(), text.len() as u64);
+        let lines = second.follower().read().unwrap();
+        assert_eq!(lines, [line(1), line(3)]);
+        assert_eq!(second.len(), fs::metadata(file.path()).unwrap().len());
+    }
+
+    #[tokio::test]
+    async fn a_follower_reads_every_line_once_and_sees_the_end() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let mut metrics = MetricsFile::open(file.path(), 0, 0.0).unwrap();
+        // More than is read at a time.
+        let many = 5000;
+        for env_steps in 0..many {
+            metrics.write(&line(env_steps)).unwrap();
+        }
+        assert!(metrics.len() > CHUNK);
+        let mut follower = metrics.follower();
+        let mut read = Vec::new();
+        let mut read_all = |follower: &mut Follower| {
+            loop {
+                let lines = follower.read().unwrap();
+                if lines.is_empty() {
+                    return read.len();
+                }
+                read.extend(lines.iter().map(|line| line.progress().env_steps));
+            }
+        };
+        assert_eq!(read_all(&mut follower), many as usize);
+        metrics.write(&line(many)).unwrap();
+        assert!(follower.more().await);
+        assert_eq!(read_all(&mut follower), many as usize + 1);
+        drop(metrics);
+        assert!(!follower.more().await);
+        assert!(read.into_iter().eq(0..=many));
+    }
+
+    #[test]
+    fn a_message_says_what_the_line_says() {
+        let message = line(9).to_message();
+        let training = message.training.unwrap();
+        assert_eq!((message.env_steps, message.episodes, message.updates), (9, 3, 2));
+        assert_eq!((training.td_loss, training.target_mean, training.epsilon), (1e-9, -3.0, 0.1 + 0.2));
+        let [task] = &message.tasks[..] else { panic!("{:?}", message.tasks) };
+        assert_eq!((task.task.as_str(), task.episodes, task.policy_lag), ("game-1", 5, Some(1)));
     }
 }

@@ -121,10 +121,12 @@ pub async fn run(
         log: ReplayLog::open(&run_dir.replay(), expected.layout, run_dir.run_id(), episodes)?,
         buffer_size: config.algorithm.buffer_size,
         keep: config.checkpoints.keep,
+        events: events.clone(),
     };
     let (to_write, write_queue) = mpsc::channel();
     let (trainer, board) =
         Trainer::new(config.clone(), run_dir.clone(), Arc::clone(&rit), loaded, news, to_write)?;
+    let metrics = trainer.metrics_follower();
     let coordinator = Coordinator::new(config.clone(), trainer.beginning(), work, fences);
 
     let stop = Arc::new(AtomicBool::new(false));
@@ -149,7 +151,7 @@ pub async fn run(
     let guard = Guard::new(run_dir.token());
     let weights =
         WeightsServer::new(WeightsService(Arc::clone(&board))).max_encoding_message_size(MESSAGE_BYTES_MAX);
-    let control = ControlService::new(events.clone(), board, Arc::new(config), rit);
+    let control = ControlService::new(events.clone(), board, metrics, Arc::new(config), rit);
     let (health_reporter, health) = tonic_health::server::health_reporter();
     health_reporter.set_serving::<WeightsServer<WeightsService>>().await;
     health_reporter.set_serving::<RolloutServer<RolloutService>>().await;

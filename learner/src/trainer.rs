@@ -3,10 +3,11 @@
 
 use crate::{
     checkpoint::{Loaded, Manifest, Progress, SnapshotMark, TrainingState},
-    evaluation::{Evaluator, TaskResult},
+    evaluation::{Evaluator, TaskResult, by_task, in_words},
     ledger::Terms,
-    metrics::{Line, MetricsFile, Recent, by_task},
+    metrics::{Follower, Line, MetricsFile, Recent},
     replay::Replay,
+    tensorboard::{EventFile, Position},
     weights::{Snapshot, WeightsBoard},
     weights_file,
     writer::{ToWrite, Written},
@@ -116,6 +117,7 @@ pub struct Trainer {
     board: Arc<WeightsBoard>,
     evaluator: Evaluator,
     metrics: MetricsFile,
+    tensorboard: EventFile,
     recent: Recent,
     standing: Standing,
     /// What the next batches are rolled with, in order.
@@ -144,7 +146,7 @@ impl Trainer {
     /// weights on. `news` must not wait.
     ///
     /// # Errors
-    /// When the metrics file or the update's threads cannot be had.
+    /// When the metrics files or the update's threads cannot be had.
     pub fn new(
         config: Config,
         run_dir: RunDir,
@@ -161,17 +163,13 @@ impl Trainer {
         let first_terms = Terms { weights_version: 0, epsilon: config.epsilon(0) };
         let task_set = config.environment.task_set;
         let tasks = task_set.tasks(Split::Training).iter().map(ToString::to_string).collect();
-        let (metrics_len, wall_s) = loaded
-            .as_ref()
-            .map_or((0, 0.0), |loaded| (loaded.state.manifest.metrics_len, loaded.state.manifest.wall_s));
-        let path = run_dir.metrics();
-        let metrics =
-            MetricsFile::open(&path, metrics_len, wall_s).map_err(|error| TrainError::Io { path, error })?;
+        let (metrics, tensorboard) = files(&run_dir, loaded.as_ref().map(|loaded| &loaded.state.manifest))?;
         let mut trainer = Self {
             replay: Replay::new(config.algorithm.buffer_size),
             board: Arc::new(WeightsBoard::new(first, lag)),
             evaluator: Evaluator::new(&config),
             metrics,
+            tensorboard,
             recent: Recent::new(tasks, task_set.has_wins()),
             standing: Standing::default(),
             terms: vec![first_terms; lag + 1].into(),
@@ -189,6 +187,11 @@ impl Trainer {
         }
         let board = Arc::clone(&trainer.board);
         Ok((trainer, board))
+    }
+
+    /// Somebody who reads what is measured.
+    pub fn metrics_follower(&self) -> Follower {
+        self.metrics.follower()
     }
 
     /// Where the run begins.
@@ -214,7 +217,7 @@ impl Trainer {
             self.board = Arc::new(WeightsBoard::new(oldest, self.config.algorithm.policy_lag));
         }
         snapshots.for_each(|snapshot| self.board.publish(snapshot));
-        self.recent.restore(manifest.recent);
+        self.recent.restore(manifest.recent, manifest.exploring);
         loaded.replay.into_iter().for_each(|episode| self.replay.insert(Arc::new(episode)));
         let named = |(task, result): (String, TaskResult)| TaskResult { task, ..result };
         self.standing = Standing {
@@ -275,7 +278,7 @@ impl Trainer {
         for episode in episodes {
             progress.env_steps += episode.steps() as u64;
             progress.episodes += 1;
-            self.recent.push(&episode);
+            self.recent.push(&episode, progress.updates);
             let episode = Arc::new(episode);
             // Without a writer there is nobody to write; checkpoints say so.
             let _ = self.writer.send(ToWrite::Episode(Arc::clone(&episode)));
@@ -310,9 +313,7 @@ impl Trainer {
                 losses: standing.losses.into(),
                 tasks: by_task(&standing.recent),
             };
-            self.metrics
-                .write(&line)
-                .map_err(|error| TrainError::Io { path: self.run_dir.metrics(), error })?;
+            self.measured(&line)?;
         }
         let mut over = after.env_steps >= self.config.training.t_max;
         if self.is_due(self.config.evaluation.every_env_steps) {
@@ -328,10 +329,17 @@ impl Trainer {
         let progress = self.standing.progress;
         let results = self.greedy(self.config.evaluation.episodes);
         let line = Line::Evaluation { progress, wall_s: self.metrics.wall_s(), tasks: by_task(&results) };
-        self.metrics.write(&line).map_err(|error| TrainError::Io { path: self.run_dir.metrics(), error })?;
+        self.measured(&line)?;
         tracing::info!(env_steps = progress.env_steps, results = %in_words(&results), "evaluated");
         self.standing.evaluation = Some((progress, results.clone()));
         Ok(results)
+    }
+
+    fn measured(&mut self, line: &Line) -> Result<(), TrainError> {
+        self.metrics.write(line).map_err(|error| TrainError::Io { path: self.run_dir.metrics(), error })?;
+        self.tensorboard
+            .write(line)
+            .map_err(|error| TrainError::Io { path: self.run_dir.tensorboard(), error })
     }
 
     fn greedy(&self, episodes: usize) -> Vec<TaskResult> {
@@ -375,7 +383,9 @@ impl Trainer {
                 terms: self.terms.iter().copied().collect(),
                 snapshots: kept.iter().map(mark).collect(),
                 recent: self.recent.windows(),
+                exploring: self.recent.exploring().to_vec(),
                 metrics_len: self.metrics.len(),
+                tensorboard: self.tensorboard.position().clone(),
                 wall_s: self.metrics.wall_s(),
                 evaluation,
                 weights_digest: weights_digest.clone(),
@@ -398,7 +408,7 @@ impl Trainer {
             progress: self.standing.progress,
             wall_s: self.metrics.wall_s(),
             weights_digest,
-            evaluation: results.into_iter().map(|result| (result.task.clone(), result)).collect(),
+            evaluation: by_task(&results),
         };
         let path = self.run_dir.summary();
         let text = serde_json::to_vec_pretty(&summary).map_err(io::Error::from);
@@ -408,15 +418,21 @@ impl Trainer {
     }
 }
 
+/// The files that show how training goes: begun, or continued from a checkpoint.
+fn files(run_dir: &RunDir, manifest: Option<&Manifest>) -> Result<(MetricsFile, EventFile), TrainError> {
+    let (len, wall_s) = manifest.map_or((0, 0.0), |manifest| (manifest.metrics_len, manifest.wall_s));
+    let path = run_dir.metrics();
+    let metrics = MetricsFile::open(&path, len, wall_s).map_err(|error| TrainError::Io { path, error })?;
+    let (position, from) = manifest.map_or((Position::default(), 0), |manifest| {
+        (manifest.tensorboard.clone(), manifest.progress.env_steps + 1)
+    });
+    let path = run_dir.tensorboard();
+    let tensorboard =
+        EventFile::create(&path, &position, from).map_err(|error| TrainError::Io { path, error })?;
+    Ok((metrics, tensorboard))
+}
+
 /// The seed of a run's own evaluations, scheduled or asked for without one.
 pub fn evaluation_seed(config: &Config) -> RunSeed {
     config.seed.derive("evaluation", 0)
-}
-
-fn in_words(results: &[TaskResult]) -> String {
-    let words = results.iter().map(|result| match result.win_rate {
-        Some(win_rate) => format!("{} wins {win_rate:.2}", result.task),
-        None => format!("{} {:.1}", result.task, result.mean_return),
-    });
-    words.collect::<Vec<_>>().join(", ")
 }

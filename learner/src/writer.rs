@@ -6,6 +6,7 @@
 
 use crate::{
     checkpoint::{self, CheckpointError, TrainingState},
+    coordinator::Event,
     replay_log::ReplayLog,
 };
 use rit_algo::Rit;
@@ -15,12 +16,23 @@ use std::{
     collections::VecDeque,
     path::PathBuf,
     sync::{Arc, mpsc},
-    time::Instant,
+    time::{Duration, Instant},
 };
-use tokio::sync::oneshot;
+use tokio::sync::{mpsc as async_mpsc, oneshot};
 
 /// Where a checkpoint lies, relative to the run directory; or why it was not written.
 pub type Written = Result<PathBuf, CheckpointError>;
+
+/// What became of a checkpoint.
+#[derive(Clone, Copy, Debug)]
+pub struct CheckpointEnded {
+    /// Environment steps collected by then.
+    pub env_steps: u64,
+    /// How long it took.
+    pub duration: Duration,
+    /// Whether it is on disk.
+    pub written: bool,
+}
 
 /// What the writer is given, in order.
 #[derive(Debug)]
@@ -44,6 +56,8 @@ pub struct Writer {
     pub buffer_size: usize,
     /// Checkpoints kept.
     pub keep: usize,
+    /// Who is told of checkpoints.
+    pub events: async_mpsc::Sender<Event>,
 }
 
 impl Writer {
@@ -60,14 +74,17 @@ impl Writer {
                 ToWrite::Checkpoint(state, answer) => {
                     let begun = Instant::now();
                     let written = self.checkpoint(&mut waiting, &state);
-                    let env_steps = state.manifest.progress.env_steps;
+                    let (env_steps, duration) = (state.manifest.progress.env_steps, begun.elapsed());
                     match &written {
                         Ok(path) => {
-                            let ms = begun.elapsed().as_millis();
+                            let ms = duration.as_millis();
                             tracing::info!(path = %path.display(), env_steps, ms, "wrote a checkpoint");
                         }
                         Err(error) => tracing::error!(%error, env_steps, "a checkpoint was not written"),
                     }
+                    let ended = CheckpointEnded { env_steps, duration, written: written.is_ok() };
+                    // At the end of a run nobody counts any more.
+                    let _ = self.events.blocking_send(Event::CheckpointEnded(ended));
                     if let Some(answer) = answer {
                         // Whoever asked may have gone.
                         let _ = answer.send(written);

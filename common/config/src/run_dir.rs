@@ -180,6 +180,11 @@ impl RunDir {
         self.root.join("metrics.jsonl")
     }
 
+    /// Event files for TensorBoard.
+    pub fn tensorboard(&self) -> PathBuf {
+        self.root.join("tensorboard")
+    }
+
     /// What the run came to.
     pub fn summary(&self) -> PathBuf {
         self.root.join("summary.json")

@@ -1,0 +1,77 @@
+//! What the coordinator answers when it is asked how the run stands: the one model of what is measured, which gRPC,
+//! terminals and Prometheus show.
+
+use super::{Actor, Coordinator};
+use crate::{
+    evaluation::TaskResult,
+    ledger::{ActorId, Counts},
+    trainer::Standing,
+};
+use rit_episode::wire::{Header, PayloadLayout};
+use rit_proto::v1;
+use std::time::Instant;
+
+impl Coordinator {
+    pub(super) fn status(&self) -> v1::RunStatus {
+        let Standing { progress, losses, recent, evaluation, replay_episodes } = &self.standing;
+        let now = Instant::now();
+        let messages = |results: &[TaskResult]| results.iter().map(TaskResult::to_message).collect();
+        // All frames of a run have the same length.
+        let frame_bytes =
+            size_of::<Header>() + PayloadLayout::new(self.config.environment.task_set.dims()).len();
+        v1::RunStatus {
+            state: self.state.into(),
+            env_steps: progress.env_steps,
+            env_steps_max: self.config.training.t_max,
+            episodes: progress.episodes,
+            updates: progress.updates,
+            epsilon: self.epsilon.into(),
+            wall_s: (now - self.started).as_secs_f64(),
+            td_loss: losses.td_loss,
+            contrastive_loss: losses.contrastive_loss,
+            grad_norm: losses.grad_norm,
+            recent: messages(recent),
+            evaluation: evaluation.as_ref().map(|(progress, results)| v1::Evaluation {
+                env_steps: progress.env_steps,
+                weights_version: progress.updates,
+                tasks: messages(results),
+            }),
+            actors: self.actors.iter().map(|(&id, actor)| self.actor_status(id, actor, now)).collect(),
+            ledger: Some(self.ledger_status()),
+            replay_episodes: *replay_episodes as u64,
+            pid: std::process::id(),
+            replay_episodes_max: self.config.algorithm.buffer_size as u64,
+            q_total_mean: losses.q_total_mean,
+            target_mean: losses.target_mean,
+            rates: Some(self.rates.rates()),
+            learner_waiting_s: self.learner_waiting.seconds(now),
+            shared_memory_bytes: self.frames * frame_bytes as u64,
+            checkpoints: Some(self.checkpoints),
+            happenings: self.happenings.list(),
+        }
+    }
+
+    fn actor_status(&self, id: ActorId, actor: &Actor, now: Instant) -> v1::ActorStatus {
+        v1::ActorStatus {
+            name: actor.name.clone(),
+            pid: actor.pid,
+            episodes: actor.episodes,
+            outstanding: self.ledger.outstanding_with(id).count() as u64,
+            silent_s: (now - actor.heard).as_secs_f64(),
+            hung: actor.hung,
+            waiting_s: actor.waiting.seconds(now),
+        }
+    }
+
+    fn ledger_status(&self) -> v1::LedgerStatus {
+        let Counts { handed_out, inserted, outstanding, rejected } = self.ledger.counts();
+        v1::LedgerStatus {
+            handed_out,
+            inserted,
+            outstanding,
+            rejected: rejected.iter().map(|(reason, &count)| (reason.name().to_owned(), count)).collect(),
+            frames_refused: self.frames_refused.iter().map(|(&name, &count)| (name.into(), count)).collect(),
+            imbalances: self.imbalances,
+        }
+    }
+}

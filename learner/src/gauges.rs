@@ -1,0 +1,148 @@
+//! What the coordinator measures beside what it decides: for people, never for training.
+
+use crate::checkpoint::Progress;
+use rit_proto::v1;
+use std::{
+    collections::VecDeque,
+    time::{Duration, Instant},
+};
+
+/// Rates are taken over so long.
+const RATES_OVER: Duration = Duration::from_secs(10);
+
+/// Happenings that are remembered.
+const HAPPENINGS: usize = 20;
+
+/// How long something lasted, all together.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Stopwatch {
+    since: Option<Instant>,
+    total: Duration,
+}
+
+impl Stopwatch {
+    /// Whether it runs from now on.
+    pub fn set(&mut self, runs: bool, now: Instant) {
+        match (self.since, runs) {
+            (None, true) => self.since = Some(now),
+            (Some(since), false) => {
+                self.total += now - since;
+                self.since = None;
+            }
+            _ => {}
+        }
+    }
+
+    /// Seconds until now.
+    pub fn seconds(&self, now: Instant) -> f64 {
+        (self.total + self.since.map_or(Duration::ZERO, |since| now - since)).as_secs_f64()
+    }
+}
+
+/// How fast a run goes, over the last seconds.
+#[derive(Debug, Default)]
+pub struct RateWindow {
+    samples: VecDeque<(Instant, Progress)>,
+}
+
+impl RateWindow {
+    /// Notes how far training has come. Call it a few times a second.
+    pub fn note(&mut self, now: Instant, progress: Progress) {
+        self.samples.push_back((now, progress));
+        while self.samples.front().is_some_and(|(then, _)| now - *then > RATES_OVER) {
+            self.samples.pop_front();
+        }
+    }
+
+    /// The rates; zero before there are two notes.
+    pub fn rates(&self) -> v1::Rates {
+        let (Some((then, before)), Some((now, after))) = (self.samples.front(), self.samples.back()) else {
+            return v1::Rates::default();
+        };
+        let seconds = (*now - *then).as_secs_f64();
+        let rate = |before: u64, after: u64| {
+            if seconds > 0.0 { after.saturating_sub(before) as f64 / seconds } else { 0.0 }
+        };
+        v1::Rates {
+            env_steps_per_s: rate(before.env_steps, after.env_steps),
+            episodes_per_s: rate(before.episodes, after.episodes),
+            updates_per_s: rate(before.updates, after.updates),
+        }
+    }
+}
+
+/// The last things that happened.
+#[derive(Debug)]
+pub struct Happenings {
+    began: Instant,
+    last: VecDeque<v1::Happening>,
+}
+
+impl Happenings {
+    /// None yet; their times count from `began`.
+    pub fn new(began: Instant) -> Self {
+        Self { began, last: VecDeque::with_capacity(HAPPENINGS) }
+    }
+
+    /// Remembers what happened, after so many environment steps.
+    pub fn note(&mut self, env_steps: u64, what: String) {
+        if self.last.len() == HAPPENINGS {
+            self.last.pop_front();
+        }
+        let wall_s = self.began.elapsed().as_secs_f64();
+        self.last.push_back(v1::Happening { wall_s, env_steps, what });
+    }
+
+    /// Oldest first.
+    pub fn list(&self) -> Vec<v1::Happening> {
+        self.last.iter().cloned().collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stopwatch_counts_while_it_runs() {
+        let begun = Instant::now();
+        let at = |s| begun + Duration::from_secs(s);
+        let mut watch = Stopwatch::default();
+        watch.set(false, at(1));
+        watch.set(true, at(2));
+        watch.set(true, at(3));
+        assert_eq!(watch.seconds(at(5)), 3.0);
+        watch.set(false, at(6));
+        assert_eq!(watch.seconds(at(9)), 4.0);
+        watch.set(true, at(10));
+        assert_eq!(watch.seconds(at(11)), 5.0);
+    }
+
+    #[test]
+    fn rates_are_those_of_the_last_seconds() {
+        let begun = Instant::now();
+        let mut window = RateWindow::default();
+        assert_eq!(window.rates(), v1::Rates::default());
+        for s in 0..=30 {
+            // A fast beginning that is long past.
+            let env_steps = if s < 5 { 1000 * s } else { 5000 + 20 * (s - 5) };
+            let progress = Progress { env_steps, episodes: 2 * s, updates: s };
+            window.note(begun + Duration::from_secs(s), progress);
+            if s == 0 {
+                assert_eq!(window.rates(), v1::Rates::default());
+            }
+        }
+        let expected = v1::Rates { env_steps_per_s: 20.0, episodes_per_s: 2.0, updates_per_s: 1.0 };
+        assert_eq!(window.rates(), expected);
+    }
+
+    #[test]
+    fn the_last_happenings_are_remembered() {
+        let mut happenings = Happenings::new(Instant::now());
+        for step in 0..50 {
+            happenings.note(step, format!("step {step}"));
+        }
+        let list = happenings.list();
+        assert_eq!((list.len(), list[0].env_steps, list[19].what.as_str()), (20, 30, "step 49"));
+    }
+}
