@@ -1,14 +1,17 @@
 //! Generates the rit.v1 types. `protox` compiles the .proto files, so no system `protoc` is needed.
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let files = ["rit/v1/weights.proto", "rit/v1/rollout.proto", "rit/v1/control.proto"];
+    let files =
+        ["rit/v1/weights.proto", "rit/v1/rollout.proto", "rit/v1/episodes.proto", "rit/v1/control.proto"];
     for file in files {
         println!("cargo:rerun-if-changed={file}");
     }
     let descriptors = protox::compile(files, ["."])?;
     tonic_prost_build::configure()
-        // Weights are passed on without a copy.
+        // Weights and frames are passed on without a copy.
         .bytes(".rit.v1.Snapshot.params")
+        .bytes(".rit.v1.Frame.header")
+        .bytes(".rit.v1.Frame.payload")
         // What callers get is printed as JSON too.
         .message_attribute("rit.v1.RunStatus", SERIALIZE)
         .message_attribute("rit.v1.ActorStatus", SERIALIZE)

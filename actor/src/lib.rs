@@ -5,6 +5,7 @@
 
 mod rollout;
 mod run;
+mod sink;
 mod weights;
 
-pub use run::{ActorError, ActorOptions, run};
+pub use run::{ActorError, ActorOptions, Learner, run};

@@ -1,14 +1,16 @@
-//! The rollout thread: a lease in, its episodes into shared memory.
+//! The rollout thread: a lease in, its episodes out.
 
-use crate::weights::Weights;
+use crate::{
+    sink::{EpisodeSink, SinkError},
+    weights::Weights,
+};
 use rit_algo::{Acting, Rit};
-use rit_config::{Config, RunDir};
+use rit_config::Config;
 use rit_env::{
     Split,
     rollout::{Job, Rollout},
 };
 use rit_episode::wire::{self, EncodeError, Frame, PayloadLayout, RunId};
-use rit_ipc::{EpisodeSender, SendError};
 use rit_proto::v1::{Lease, Snapshot};
 use std::sync::{
     Arc,
@@ -37,14 +39,14 @@ pub enum RolloutError {
     Encode(#[from] EncodeError),
     /// A frame that could not be sent.
     #[error(transparent)]
-    Send(#[from] SendError),
+    Send(#[from] SinkError),
 }
 
 /// What the rollout thread works with.
 pub(crate) struct Roller {
     pub(crate) rit: Arc<Rit>,
     pub(crate) rollout: Rollout,
-    pub(crate) sender: EpisodeSender,
+    pub(crate) sink: EpisodeSink,
     pub(crate) layout: PayloadLayout,
     pub(crate) run_id: RunId,
     pub(crate) actor: u32,
@@ -63,11 +65,6 @@ impl Roller {
             .with_exploration_persistence(algorithm.exploration_persistence)
     }
 
-    /// Where the run's shared memory lies.
-    pub(crate) fn space(run_dir: &RunDir) -> Result<rit_ipc::RunSpace, rit_ipc::RunSpaceError> {
-        rit_ipc::RunSpace::new(&run_dir.shared_memory_root())
-    }
-
     /// Rolls leases until there are no more; says which are `done`.
     pub(crate) fn run(
         mut self,
@@ -76,6 +73,8 @@ impl Roller {
         done: &mpsc::Sender<u64>,
     ) -> Result<(), RolloutError> {
         let mut frame = Frame::new(&self.layout);
+        let stop = Arc::clone(&self.stop);
+        let give_up = || stop.load(Ordering::Relaxed);
         let mut acting: Option<(u64, Acting)> = None;
         while let Some(lease) = leases.blocking_recv() {
             let version = lease.weights_version;
@@ -99,8 +98,9 @@ impl Roller {
                 .collect();
             for episode in self.rollout.roll(acting, &jobs) {
                 wire::encode(&episode, &self.layout, self.run_id, self.actor, &mut frame)?;
-                self.sender.send(&frame, &|| self.stop.load(Ordering::Relaxed))?;
+                self.sink.send(&frame, &give_up)?;
             }
+            self.sink.flush(&give_up)?;
             if done.blocking_send(lease.lease).is_err() {
                 break;
             }

@@ -2,17 +2,18 @@
 
 use crate::{
     rollout::{Roller, RolloutError},
+    sink::{EpisodeSink, FrameStream},
     weights::Weights,
 };
 use rit_algo::{ConfigError, Rit};
-use rit_config::{Config, RunDir};
+use rit_config::{Config, RunDir, resolve};
 use rit_episode::wire::{self, PayloadLayout};
-use rit_ipc::{EpisodeSender, OpenError, RunSpaceError};
+use rit_ipc::{EpisodeSender, OpenError, RunSpace, RunSpaceError};
 use rit_proto::{
-    transport::{self, Address, AddressError, ConnectError},
+    transport::{self, Address, AddressError, ConnectError, Credentials},
     v1::{
-        ActorMessage, Done, Heartbeat, Hello, LearnerMessage, Lease, Leaving, actor_message, learner_message,
-        rollout_client::RolloutClient,
+        ActorMessage, Done, Heartbeat, Hello, LearnerMessage, Lease, Leaving, Welcome, actor_message,
+        learner_message, rollout_client::RolloutClient,
     },
 };
 use std::{
@@ -43,6 +44,15 @@ const RECONNECT_TIMEOUT: Duration = Duration::from_secs(60);
 /// From one look for it to the next.
 const RECONNECT_EVERY: Duration = Duration::from_millis(50);
 
+/// Where an actor finds its learner.
+#[derive(Clone, Debug)]
+pub enum Learner {
+    /// On this host, by its run directory: episodes travel through shared memory.
+    Here(RunDir),
+    /// On any host, by its address: episodes travel over gRPC.
+    At(Address, Credentials),
+}
+
 /// What an actor is told on the command line.
 #[derive(Clone, Debug)]
 pub struct ActorOptions {
@@ -72,6 +82,12 @@ pub enum ActorError {
     /// An actor of this name is there already, or the builds differ.
     #[error("the learner refused: {0}")]
     Refused(String),
+    /// The learner's configuration means nothing here.
+    #[error("the learner's configuration cannot be used: {0}; use the same build")]
+    Config(#[from] rit_config::ConfigError),
+    /// What the learner says of its run is not whole.
+    #[error("the learner's run has no number of 16 bytes; use the same build")]
+    RunId,
     /// The configuration makes no model.
     #[error(transparent)]
     Model(#[from] ConfigError),
@@ -87,6 +103,9 @@ pub enum ActorError {
     /// The learner ended without a farewell.
     #[error("the learner has gone and does not come back: {0}")]
     LearnerGone(String),
+    /// The system gives no random number.
+    #[error("cannot draw a random number: {0}")]
+    Random(io::Error),
     /// The rollout thread could not be started.
     #[error("cannot start the rollout thread: {0}")]
     Thread(io::Error),
@@ -99,13 +118,16 @@ impl ActorError {
     /// Whether it may be different when the learner is back.
     fn may_pass(&self) -> bool {
         match self {
+            Self::Connect(error) => error.may_pass(),
             Self::NoAddress { .. }
             | Self::Address(_)
-            | Self::Connect(_)
             | Self::SharedMemory(_)
             | Self::LearnerGone(_)
             | Self::Rollout(RolloutError::Weights(_) | RolloutError::Send(_)) => true,
             Self::Refused(_)
+            | Self::Config(_)
+            | Self::RunId
+            | Self::Random(_)
             | Self::Model(_)
             | Self::RunSpace(_)
             | Self::Rollout(_)
@@ -121,14 +143,15 @@ impl ActorError {
 /// # Errors
 /// When it cannot begin, when rolling fails, or when the learner goes and does not come back.
 pub async fn run(
-    run_dir: RunDir,
-    config: Config,
+    learner: Learner,
     options: ActorOptions,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), ActorError> {
-    let rit = Arc::new(Rit::new(config.rit())?);
-    let layout = PayloadLayout::new(config.environment.task_set.dims());
-    let actor = Actor { run_dir, config, options, rit, layout };
+    let mut instance = [0; size_of::<u64>()];
+    // So few bytes come at once, or not at all.
+    rustix::rand::getrandom(&mut instance, rustix::rand::GetRandomFlags::empty())
+        .map_err(|error| ActorError::Random(error.into()))?;
+    let actor = Actor { learner, options, instance: u64::from_le_bytes(instance) };
     let (leave, leaving) = watch::channel(false);
     let life = actor.life(leaving);
     tokio::pin!(life);
@@ -141,12 +164,26 @@ pub async fn run(
     }
 }
 
+impl Learner {
+    /// Where it listens now, and what it wants to be shown.
+    fn find(&self) -> Result<(Address, Credentials), ActorError> {
+        match self {
+            Self::At(address, credentials) => Ok((address.clone(), credentials.clone())),
+            Self::Here(run_dir) => {
+                let no_address =
+                    |error| ActorError::NoAddress { run_dir: run_dir.root().display().to_string(), error };
+                let address = fs::read_to_string(run_dir.address()).map_err(no_address)?.trim().parse()?;
+                Ok((address, Credentials::token(run_dir.token())))
+            }
+        }
+    }
+}
+
 struct Actor {
-    run_dir: RunDir,
-    config: Config,
+    learner: Learner,
     options: ActorOptions,
-    rit: Arc<Rit>,
-    layout: PayloadLayout,
+    /// Tells this process from every other.
+    instance: u64,
 }
 
 impl Actor {
@@ -181,18 +218,16 @@ impl Actor {
         leaving: &mut watch::Receiver<bool>,
         joined: &mut bool,
     ) -> Result<(), ActorError> {
-        let run_dir = &self.run_dir;
-        let no_address =
-            |error| ActorError::NoAddress { run_dir: run_dir.root().display().to_string(), error };
-        let address: Address = fs::read_to_string(run_dir.address()).map_err(no_address)?.trim().parse()?;
-        let client = transport::connect(&address, run_dir.token()).await?;
+        let (address, credentials) = self.learner.find()?;
+        let client = transport::connect(&address, &credentials).await?;
 
         let (outbox, messages) = mpsc::channel(OUTBOX);
         let hello = Hello {
             name: self.options.name.clone(),
             pid: std::process::id(),
             layout_version: wire::LAYOUT_VERSION,
-            capacity: self.config.actors.episodes_at_once as u32,
+            instance: self.instance,
+            remote: matches!(self.learner, Learner::At(..)),
         };
         outbox.try_send(say(actor_message::Message::Hello(hello))).map_err(|error| gone(&error))?;
         let answer = RolloutClient::new(client.clone()).join(ReceiverStream::new(messages)).await;
@@ -203,18 +238,33 @@ impl Actor {
             return Err(gone(&"it did not say welcome"));
         };
         *joined = true;
+        let Welcome { actor, run_id, config } = welcome;
+        let config: Config = resolve(&config, "the learner's configuration", &[])?;
+        let layout = PayloadLayout::new(config.environment.task_set.dims());
 
         let (leases, lease_queue) = mpsc::channel(1);
         let (done, lease_done) = mpsc::channel(1);
         let stop = Arc::new(AtomicBool::new(false));
         let roller = Roller {
-            rit: Arc::clone(&self.rit),
-            rollout: Roller::rollout(&self.config),
-            sender: EpisodeSender::open(&Roller::space(run_dir)?, self.layout.len(), OPEN_TIMEOUT)?,
-            layout: self.layout,
-            run_id: run_dir.run_id(),
-            actor: welcome.actor,
-            weights: Weights::watch(client).await.map_err(RolloutError::Weights)?,
+            rit: Arc::new(Rit::new(config.rit())?),
+            rollout: Roller::rollout(&config),
+            sink: match &self.learner {
+                Learner::Here(run_dir) => {
+                    let space = RunSpace::new(&run_dir.shared_memory_root())?;
+                    let sender = EpisodeSender::open(&space, layout.len(), OPEN_TIMEOUT)?;
+                    EpisodeSink::SharedMemory(Box::new(sender))
+                }
+                Learner::At(..) => {
+                    let stream = FrameStream::open(client.clone()).await;
+                    EpisodeSink::Stream(stream.map_err(|status| refusal(&status))?)
+                }
+            },
+            layout,
+            run_id: run_id.try_into().map_err(|_| ActorError::RunId)?,
+            actor,
+            weights: Weights::watch(client, config.algorithm.policy_lag)
+                .await
+                .map_err(RolloutError::Weights)?,
             stop: Arc::clone(&stop),
         };
         let (result, mut rolled) = oneshot::channel();
@@ -225,7 +275,7 @@ impl Actor {
                 let _ = result.send(roller.run(&runtime, lease_queue, &done));
             })
             .map_err(ActorError::Thread)?;
-        tracing::info!(actor = welcome.actor, %address, "joined");
+        tracing::info!(actor, %address, "joined");
 
         let conversation = converse(from_learner, outbox, leases, lease_done, leaving);
         let ended = tokio::select! {
@@ -288,9 +338,12 @@ fn gone(what: &dyn fmt::Display) -> ActorError {
 
 fn refusal(status: &tonic::Status) -> ActorError {
     match status.code() {
-        Code::Unavailable | Code::Cancelled | Code::Unknown => {
-            ActorError::LearnerGone(status.message().to_owned())
-        }
+        // The last two: it has as much to do as it takes on.
+        Code::Unavailable
+        | Code::Cancelled
+        | Code::Unknown
+        | Code::ResourceExhausted
+        | Code::DeadlineExceeded => ActorError::LearnerGone(status.message().to_owned()),
         _ => ActorError::Refused(status.message().to_owned()),
     }
 }

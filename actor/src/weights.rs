@@ -5,7 +5,7 @@ use rit_proto::{
     transport::Client,
     v1::{GetRequest, Snapshot, WatchRequest, weights_client::WeightsClient},
 };
-use std::sync::Arc;
+use std::{collections::VecDeque, sync::Arc};
 use tokio::sync::watch;
 use tonic::Status;
 
@@ -13,21 +13,28 @@ use tonic::Status;
 #[derive(Clone)]
 pub(crate) struct Weights {
     client: WeightsClient<Client>,
-    newest: watch::Receiver<Option<Arc<Snapshot>>>,
+    /// The newest, oldest first: as many as leases ask for at a time.
+    newest: watch::Receiver<VecDeque<Arc<Snapshot>>>,
 }
 
 impl Weights {
-    /// Begins to watch.
-    pub(crate) async fn watch(client: Client) -> Result<Self, Status> {
+    /// Begins to watch. A lease asks for weights that are up to `policy_lag` updates behind the newest.
+    pub(crate) async fn watch(client: Client, policy_lag: usize) -> Result<Self, Status> {
         let mut client = WeightsClient::new(client).max_decoding_message_size(MESSAGE_BYTES_MAX);
         let mut snapshots = client.watch(WatchRequest {}).await?.into_inner();
-        let (sender, newest) = watch::channel(None);
+        let (sender, newest) = watch::channel(VecDeque::new());
         tokio::spawn(async move {
             // Read as fast as they come, so that what stands here is the newest; ends with the learner.
             while let Ok(Some(snapshot)) = snapshots.message().await {
-                if sender.send(Some(Arc::new(snapshot))).is_err() {
+                if sender.is_closed() {
                     return;
                 }
+                sender.send_modify(|kept| {
+                    kept.push_back(Arc::new(snapshot));
+                    while kept.len() > policy_lag + 1 {
+                        kept.pop_front();
+                    }
+                });
             }
         });
         Ok(Self { client, newest })
@@ -36,14 +43,16 @@ impl Weights {
     /// The snapshot of this version, which the learner has made or is about to send.
     pub(crate) async fn get(&mut self, version: u64) -> Result<Arc<Snapshot>, Status> {
         let is_there =
-            |newest: &Option<Arc<Snapshot>>| newest.as_ref().is_some_and(|newest| newest.version >= version);
-        let newest = self.newest.wait_for(is_there).await;
-        let newest =
-            newest.map_err(|_| Status::unavailable("the learner sends no weights any more"))?.clone();
-        match newest {
-            Some(newest) if newest.version == version => Ok(newest),
+            |kept: &VecDeque<Arc<Snapshot>>| kept.back().is_some_and(|newest| newest.version >= version);
+        let kept = self.newest.wait_for(is_there).await;
+        let kept = kept.map_err(|_| Status::unavailable("the learner sends no weights any more"))?;
+        let found = kept.iter().find(|snapshot| snapshot.version == version).map(Arc::clone);
+        // Nothing may be held while the learner is asked.
+        drop(kept);
+        match found {
+            Some(found) => Ok(found),
             // Skipped: this actor was slow, or came when newer ones were out already.
-            _ => Ok(Arc::new(self.client.get(GetRequest { version }).await?.into_inner())),
+            None => Ok(Arc::new(self.client.get(GetRequest { version }).await?.into_inner())),
         }
     }
 }

@@ -2,6 +2,7 @@
 
 use crate::logging::LogOptions;
 use clap::{Args, Parser, Subcommand, ValueEnum, builder::TypedValueParser as _};
+use rit_proto::transport::{Address, CredentialFiles, Credentials, CredentialsError};
 use std::{fmt, path::PathBuf};
 
 /// Multi-task multi-agent reinforcement learning with interaction and task representations.
@@ -20,7 +21,7 @@ pub enum Command {
     Train(TrainOptions),
     /// Start a learner alone; actors join it
     Learner(LearnerOptions),
-    /// Start one actor; it joins the learner of a run directory
+    /// Start one actor; it joins the learner of a run directory, or of an address
     Actor(ActorOptions),
     /// Roll greedy episodes with a run's newest checkpoint, or with a script
     Evaluate(EvaluateOptions),
@@ -34,6 +35,8 @@ pub enum Command {
     Bench(BenchOptions),
     /// Draw learning curves of one or several runs of an experiment
     Plot(PlotOptions),
+    /// Make an authority, and certificates for a learner and for those who call it over TCP
+    Certificates(CertificatesOptions),
     /// List the experiments that come with the program
     Experiments,
     /// Print completions for a shell, such as `rit completions bash > /etc/bash_completion.d/rit`
@@ -101,15 +104,66 @@ pub struct LearnerOptions {
 
 #[derive(Args, Debug)]
 pub struct ActorOptions {
-    /// Run directory of the learner
-    #[arg(long, value_name = "DIR")]
-    pub run_dir: PathBuf,
+    /// Run directory of a learner on this host; episodes travel through shared memory
+    #[arg(long, value_name = "DIR", required_unless_present = "address")]
+    pub run_dir: Option<PathBuf>,
+    /// Address of a learner on any host, such as tcp:10.0.0.1:50051; episodes travel over gRPC
+    #[arg(long, value_name = "ADDRESS", conflicts_with = "run_dir")]
+    pub address: Option<Address>,
+    #[command(flatten)]
+    pub credentials: CredentialOptions,
     /// Name of this actor, unique in its run
     #[arg(long, default_value = "actor-0")]
     pub name: String,
     /// Stop when standard input ends: whoever started this process has gone
     #[arg(long, hide = true)]
     pub supervised: bool,
+}
+
+/// What a caller shows a learner that is reached by its address.
+#[derive(Args, Debug)]
+pub struct CredentialOptions {
+    /// File of mode 600 with the token that the learner demands, its learner.token_file
+    #[arg(long, value_name = "FILE", requires = "address")]
+    pub token_file: Option<PathBuf>,
+    /// Authority of the learner's certificate; without it there is no TLS
+    #[arg(long, value_name = "FILE", requires = "address")]
+    pub tls_ca: Option<PathBuf>,
+    /// This caller's certificate, of the learner's learner.tls.client_ca
+    #[arg(long, value_name = "FILE", requires = "address")]
+    pub tls_certificate: Option<PathBuf>,
+    /// Its key, a file of mode 600
+    #[arg(long, value_name = "FILE", requires = "address")]
+    pub tls_key: Option<PathBuf>,
+}
+
+impl CredentialOptions {
+    /// What the files hold.
+    ///
+    /// # Errors
+    /// When one cannot be used.
+    pub fn read(self) -> Result<Credentials, CredentialsError> {
+        let Self { token_file, tls_ca, tls_certificate, tls_key } = self;
+        Credentials::read(&CredentialFiles {
+            token: token_file,
+            ca: tls_ca,
+            certificate: tls_certificate,
+            key: tls_key,
+        })
+    }
+}
+
+#[derive(Args, Debug)]
+pub struct CertificatesOptions {
+    /// Folder to make them in
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Names and IP addresses by which callers reach the learner
+    #[arg(long = "host", value_name = "NAME", required = true, num_args = 1..)]
+    pub hosts: Vec<String>,
+    /// Days that they are valid for
+    #[arg(long, value_name = "N", default_value_t = 365, value_parser = clap::value_parser!(u32).range(1..=3650))]
+    pub days: u32,
 }
 
 /// Who plays, and what.
@@ -273,9 +327,14 @@ fn positive(text: &str) -> Result<f64, String> {
 
 #[derive(Args, Debug)]
 pub struct CtlOptions {
-    /// Run directory
+    /// Run directory of a learner on this host
     #[arg(long, value_name = "DIR", global = true)]
     pub run: Option<PathBuf>,
+    /// Address of a learner on any host, such as tcp:10.0.0.1:50051; give it before the command
+    #[arg(long, value_name = "ADDRESS", conflicts_with = "run")]
+    pub address: Option<Address>,
+    #[command(flatten)]
+    pub credentials: CredentialOptions,
     /// Print JSON
     #[arg(long, global = true)]
     pub json: bool,

@@ -3,7 +3,7 @@
 use crate::failure::Failure;
 use rit_config::RunDir;
 use rit_proto::{
-    transport::{self, Client},
+    transport::{self, Client, Credentials},
     v1::control_client::ControlClient,
 };
 use std::fs;
@@ -20,5 +20,5 @@ pub async fn connect(run_dir: &RunDir) -> Result<ControlClient<Client>, Failure>
         ))
     })?;
     let address = address.trim().parse().map_err(Failure::runtime)?;
-    Ok(ControlClient::new(transport::connect(&address, run_dir.token()).await?))
+    Ok(ControlClient::new(transport::connect(&address, &Credentials::token(run_dir.token())).await?))
 }

@@ -8,7 +8,7 @@ use crate::{
 };
 use rit_config::RunDir;
 use rit_proto::{
-    transport::Client,
+    transport::{self, Client},
     v1::{
         CheckpointRequest, EvaluateRequest, Evaluation, MetricsRequest, PauseRequest, ResumeRequest,
         RunStatus, StatusRequest, StopRequest, control_client::ControlClient, metrics_update::Update,
@@ -16,17 +16,25 @@ use rit_proto::{
 };
 use std::{
     io::{self, Write as _},
+    path::PathBuf,
     process::ExitCode,
 };
 
 /// `rit ctl`.
 #[allow(clippy::print_stdout, reason = "what the command is for")]
 pub async fn run(options: CtlOptions) -> Result<ExitCode, Failure> {
-    let Some(run) = &options.run else {
-        return Err(Failure::input_message("which run? give --run DIR"));
+    let (mut control, root) = match (options.address, options.run) {
+        (Some(address), _) => {
+            let client = transport::connect(&address, &options.credentials.read()?).await?;
+            // Paths are then those of the learner's host, relative to its run directory.
+            (ControlClient::new(client), PathBuf::new())
+        }
+        (None, Some(run)) => {
+            let (run_dir, _) = RunDir::open(&run)?;
+            (control::connect(&run_dir).await?, run_dir.root().to_owned())
+        }
+        (None, None) => return Err(Failure::input_message("which run? give --run DIR or --address ADDRESS")),
     };
-    let (run_dir, _) = RunDir::open(run)?;
-    let mut control = control::connect(&run_dir).await?;
     let text = match options.command {
         CtlCommand::Status => status(&control.status(StatusRequest {}).await?.into_inner(), options.json)?,
         CtlCommand::Pause => status(&control.pause(PauseRequest {}).await?.into_inner(), options.json)?,
@@ -38,7 +46,7 @@ pub async fn run(options: CtlOptions) -> Result<ExitCode, Failure> {
         }
         CtlCommand::Checkpoint => {
             let written = control.checkpoint(CheckpointRequest {}).await?.into_inner();
-            let path = run_dir.root().join(&written.path);
+            let path = root.join(&written.path);
             let words = format!("{}\nweights digest {}\n", path.display(), written.weights_digest);
             if options.json { json(&written)? } else { words }
         }
@@ -127,7 +135,9 @@ fn status(status: &RunStatus, as_json: bool) -> Result<String, Failure> {
     lines.push(format!("{:18} process {}", "learner", status.pid));
     for actor in &status.actors {
         let (name, pid) = (&actor.name, actor.pid);
-        lines.push(format!("{name:18} process {pid}, {} episodes", grouped(actor.episodes)));
+        let on_another_host = if actor.remote { " on another host" } else { "" };
+        let episodes = grouped(actor.episodes);
+        lines.push(format!("{name:18} process {pid}{on_another_host}, {episodes} episodes"));
     }
     let mut text = lines.join("\n") + "\n";
     if !status.recent.is_empty() {

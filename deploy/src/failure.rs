@@ -4,7 +4,7 @@ use rit_actor::ActorError;
 use rit_config::{ConfigError, RunDirError};
 use rit_env::{UnknownName, particle::UnfitScript};
 use rit_learner::{LearnerError, weights_file::WeightsFileError};
-use rit_proto::transport::ConnectError;
+use rit_proto::transport::{ConnectError, CredentialsError};
 use std::{fmt, process::ExitCode};
 
 /// Exit code of a run that was interrupted and ended in order, as shells have it for Ctrl-C.
@@ -91,14 +91,21 @@ impl From<WeightsFileError> for Failure {
 
 impl From<ConnectError> for Failure {
     fn from(error: ConnectError) -> Self {
-        Self::runtime(error)
+        if error.may_pass() { Self::runtime(error) } else { Self::input(error) }
+    }
+}
+
+impl From<CredentialsError> for Failure {
+    fn from(error: CredentialsError) -> Self {
+        Self::input(error)
     }
 }
 
 impl From<LearnerError> for Failure {
     fn from(error: LearnerError) -> Self {
         match error {
-            LearnerError::Address(_)
+            LearnerError::Access(_)
+            | LearnerError::Address(_)
             | LearnerError::Listen(_)
             | LearnerError::RunSpace(_)
             | LearnerError::SharedMemory(_)
@@ -112,9 +119,12 @@ impl From<LearnerError> for Failure {
 impl From<ActorError> for Failure {
     fn from(error: ActorError) -> Self {
         match error {
+            ActorError::Connect(error) => error.into(),
             ActorError::NoAddress { .. }
             | ActorError::Address(_)
             | ActorError::Refused(_)
+            | ActorError::Config(_)
+            | ActorError::RunId
             | ActorError::Model(_)
             | ActorError::RunSpace(_)
             | ActorError::SharedMemory(_) => Self::input(error),

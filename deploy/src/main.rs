@@ -2,6 +2,7 @@
 //! executing itself; the same sub-commands are what a service unit or a cluster starts.
 
 mod bench;
+mod certificates;
 mod cli;
 mod control;
 mod ctl;
@@ -55,6 +56,7 @@ async fn run(cli: Cli) -> Result<ExitCode, Failure> {
         Command::Soak(options) => soak::run(options).await,
         Command::Bench(options) => bench::run(&options),
         Command::Plot(options) => plot::run(&options),
+        Command::Certificates(options) => certificates::run(&options),
         Command::Experiments => experiments::print(),
         Command::Completions { shell } => {
             clap_complete::generate(shell, &mut Cli::command(), "rit", &mut std::io::stdout());

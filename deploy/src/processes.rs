@@ -7,6 +7,7 @@ use crate::{
     logging::LogOptions,
     shutdown,
 };
+use rit_actor::Learner;
 use rit_config::RunDir;
 use std::process::ExitCode;
 use tracing::Instrument as _;
@@ -32,9 +33,15 @@ pub async fn learner(options: LearnerOptions, logs: LogOptions) -> Result<ExitCo
 /// `rit actor`.
 pub async fn actor(options: ActorOptions, logs: LogOptions) -> Result<ExitCode, Failure> {
     let span = logs.start(&options.name)?;
-    let (run_dir, config) = RunDir::open(&options.run_dir)?;
+    let learner = match (options.address, options.run_dir) {
+        (Some(address), _) => Learner::At(address, options.credentials.read()?),
+        (None, Some(run_dir)) => Learner::Here(RunDir::open(&run_dir)?.0),
+        (None, None) => {
+            return Err(Failure::input_message("which learner? give --run-dir DIR or --address ADDRESS"));
+        }
+    };
     let shutdown = shutdown::requested(options.supervised);
     let options = rit_actor::ActorOptions { name: options.name, supervised: options.supervised };
-    rit_actor::run(run_dir, config, options, shutdown).instrument(span).await?;
+    rit_actor::run(learner, options, shutdown).instrument(span).await?;
     Ok(ExitCode::SUCCESS)
 }

@@ -12,7 +12,7 @@ use crate::{
 use rit_config::{Config, RunDir};
 use rit_ipc::RunSpace;
 use rit_proto::{
-    transport::{self, Client},
+    transport::{self, Client, Credentials},
     v1::{RunStatus, StatusRequest, StopRequest, TaskResult, control_client::ControlClient},
 };
 use std::{
@@ -81,10 +81,12 @@ fn prepare(options: &ConfigOptions) -> Result<(RunDir, Config, String), Failure>
 }
 
 fn refuse_no_actors(config: &Config) -> Result<(), Failure> {
-    if config.actors.count > 0 {
+    if config.actors.count > 0 || config.actors.remote > 0 {
         return Ok(());
     }
-    Err(Failure::input_message("actors.count = 0: `rit train` needs at least one actor"))
+    Err(Failure::input_message(
+        "actors.count = 0: `rit train` needs at least one actor; set actors.remote for actors on other hosts",
+    ))
 }
 
 /// How a run came to its end in order.
@@ -190,7 +192,8 @@ impl Run<'_> {
 
     /// A hung actor is of no use; when it is dead it is restarted like any other.
     fn kill_hung_actors(&mut self, status: &RunStatus) {
-        for hung in status.actors.iter().filter(|actor| actor.hung) {
+        // The process of one on another host has a number that may be anybody's here.
+        for hung in status.actors.iter().filter(|actor| actor.hung && !actor.remote) {
             if let Some(actor) = self.actors.iter_mut().find(|actor| actor.id() == Some(hung.pid)) {
                 self.progress
                     .say(&format!("{} has hung for {:.0} s and is killed", hung.name, hung.silent_s));
@@ -228,7 +231,8 @@ impl Run<'_> {
                 )));
             }
         };
-        Ok(ControlClient::new(transport::connect(&address, self.run_dir.token()).await?))
+        let credentials = Credentials::token(self.run_dir.token());
+        Ok(ControlClient::new(transport::connect(&address, &credentials).await?))
     }
 
     async fn actor_ended(

@@ -6,7 +6,7 @@ mod common;
 use common::{RunFolder, json_lines, learner_pid, output, rit};
 use rit_config::RunDir;
 use rit_proto::{
-    transport::{self, Client},
+    transport::{self, Client, Credentials},
     v1::{MetricsRequest, StatusRequest, control_client::ControlClient, metrics_update::Update},
 };
 use serde_json::Value;
@@ -18,7 +18,7 @@ const RUN: &[&str] = &["matrix-game", "--seed", "3", "--set", "learner.metrics_e
 async fn connect(run_dir: &Path) -> ControlClient<Client> {
     let (run_dir, _) = RunDir::open(run_dir).unwrap();
     let address = fs::read_to_string(run_dir.address()).unwrap().trim().parse().unwrap();
-    ControlClient::new(transport::connect(&address, run_dir.token()).await.unwrap())
+    ControlClient::new(transport::connect(&address, &Credentials::token(run_dir.token())).await.unwrap())
 }
 
 #[test]

@@ -36,7 +36,7 @@ pub const ACTOR_QUEUE: usize = 64;
 /// What happens to a run.
 #[derive(Debug)]
 pub enum Event {
-    /// An episode was read from shared memory and found valid.
+    /// An episode was read and found valid.
     Episode(ActorId, Box<Episode>),
     /// A frame was refused.
     FrameRefused(&'static str),
@@ -86,7 +86,10 @@ pub enum Control {
 struct Actor {
     name: String,
     pid: u32,
-    capacity: usize,
+    /// Tells the process from another of this name.
+    instance: u64,
+    /// On another host.
+    remote: bool,
     to: async_mpsc::Sender<Result<LearnerMessage, Status>>,
     /// Episodes inserted.
     episodes: u64,
@@ -111,6 +114,8 @@ impl Actor {
 /// The coordinator.
 pub struct Coordinator {
     config: Config,
+    /// What every actor is told when it joins, but for its own number.
+    welcome: v1::Welcome,
     ledger: Ledger,
     actors: BTreeMap<ActorId, Actor>,
     next_actor: ActorId,
@@ -135,9 +140,10 @@ pub struct Coordinator {
 }
 
 impl Coordinator {
-    /// A coordinator where a run begins. `work` leads to the trainer, `fences` to the receiving thread.
+    /// A coordinator where a run begins. Actors are told `welcome`; `work` leads to the trainer, `fences` to the receiving thread.
     pub fn new(
         config: Config,
+        welcome: v1::Welcome,
         beginning: Beginning,
         work: mpsc::Sender<Work>,
         fences: mpsc::Sender<Fence>,
@@ -161,6 +167,7 @@ impl Coordinator {
             imbalances: 0,
             started,
             config,
+            welcome,
             work,
             fences,
         }
@@ -229,7 +236,7 @@ impl Coordinator {
                 let id = joined.as_ref().ok().copied();
                 if answer.send(joined).is_ok() {
                     if let Some(id) = id {
-                        self.send(id, Message::Welcome(v1::Welcome { actor: id }));
+                        self.send(id, Message::Welcome(v1::Welcome { actor: id, ..self.welcome.clone() }));
                         self.hand_out();
                     }
                 } else if let Some(id) = id {
@@ -334,11 +341,22 @@ impl Coordinator {
         hello: v1::Hello,
         to: async_mpsc::Sender<Result<LearnerMessage, Status>>,
     ) -> Result<ActorId, Status> {
-        let v1::Hello { name, pid, layout_version, capacity } = hello;
+        let v1::Hello { name, pid, layout_version, instance, remote } = hello;
         if layout_version != wire::LAYOUT_VERSION {
             return Err(Status::failed_precondition(format!(
                 "actor {name} writes frame layout {layout_version}, this learner reads {}; use the same build",
                 wire::LAYOUT_VERSION
+            )));
+        }
+        // The same process, whose link broke before this side noticed; or the successor of one given up.
+        let follows = |other: &Actor| other.name == name && (other.instance == instance || other.hung);
+        if let Some(former) = self.actors.iter().find(|(_, other)| follows(other)).map(|(&id, _)| id) {
+            self.gone(former);
+        }
+        let remote_max = self.config.actors.remote;
+        if remote && self.actors.values().filter(|actor| actor.remote).count() >= remote_max {
+            return Err(Status::failed_precondition(format!(
+                "actor {name} is on another host, and the learner takes {remote_max} of those; set actors.remote higher"
             )));
         }
         if let Some(other) = self.actors.values().find(|actor| actor.name == name) {
@@ -349,15 +367,15 @@ impl Coordinator {
         }
         let id = self.next_actor;
         self.next_actor += 1;
-        tracing::info!(name, pid, actor = id, "an actor joined");
+        tracing::info!(name, pid, remote, actor = id, "an actor joined");
         self.happened(format!("{name} joined"));
-        let capacity = capacity.clamp(1, 4096) as usize;
         self.actors.insert(
             id,
             Actor {
                 name,
                 pid,
-                capacity,
+                instance,
+                remote,
                 to,
                 episodes: 0,
                 leases: 0,
@@ -431,10 +449,9 @@ impl Coordinator {
             return;
         }
         let share = self.config.algorithm.n_rollout_threads.div_ceil(self.actors.len().max(1));
-        let idle = |(id, actor): (&ActorId, &Actor)| {
-            actor.is_idle(*id, &self.ledger).then_some((*id, actor.capacity.min(share)))
-        };
-        for (id, limit) in self.actors.iter().filter_map(idle).collect::<Vec<_>>() {
+        let limit = share.min(self.config.actors.episodes_at_once);
+        let idle = |(id, actor): (&ActorId, &Actor)| actor.is_idle(*id, &self.ledger).then_some(*id);
+        for id in self.actors.iter().filter_map(idle).collect::<Vec<_>>() {
             let Some(Lease { episodes, terms }) = self.ledger.lease(id, limit) else { return };
             let Terms { weights_version, epsilon } = terms;
             let lease = self.actors.get_mut(&id).map_or(0, |actor| {

@@ -6,6 +6,7 @@
 pub mod checkpoint;
 pub mod control_service;
 pub mod coordinator;
+pub mod episodes_service;
 pub mod evaluation;
 pub mod gauges;
 pub mod ledger;

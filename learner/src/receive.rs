@@ -1,7 +1,8 @@
-//! The receiving thread: reads frames where they lie, checks them, and passes episodes on.
+//! Reads frames, checks them, and passes episodes on: [`receive`] is the thread that does so with those in shared
+//! memory, where they lie.
 
 use crate::{coordinator::Event, ledger::ActorId};
-use rit_episode::wire::{self, Expected};
+use rit_episode::wire::{self, Expected, Header, Rejection};
 use rit_ipc::{EpisodeReceiver, ReceiveError};
 use std::{
     sync::{
@@ -27,6 +28,18 @@ pub struct Fence {
     pub lease: u64,
 }
 
+/// What a frame means, however it came.
+pub fn read(header: Result<Header, Rejection>, payload: &[u8], expected: &Expected) -> Event {
+    let read = header.and_then(|header| Ok((header.actor, wire::decode(&header, payload, expected)?)));
+    match read {
+        Ok((actor, episode)) => Event::Episode(actor, Box::new(episode)),
+        Err(rejection) => {
+            tracing::warn!(%rejection, "refused a frame");
+            Event::FrameRefused(rejection.reason())
+        }
+    }
+}
+
 /// Receives until `stop` is set or nobody listens any more.
 ///
 /// # Errors
@@ -43,14 +56,7 @@ pub fn receive(
         // Fences are taken up before frames are read and answered after.
         let fences: Vec<Fence> = fences.try_iter().collect();
         while let Some(frame) = receiver.receive()? {
-            let header = frame.header();
-            let event = match wire::decode(header, frame.payload(), expected) {
-                Ok(episode) => Event::Episode(header.actor, Box::new(episode)),
-                Err(rejection) => {
-                    tracing::warn!(%rejection, "refused a frame");
-                    Event::FrameRefused(rejection.reason())
-                }
-            };
+            let event = read(Ok(*frame.header()), frame.payload(), expected);
             drop(frame);
             if events.blocking_send(event).is_err() {
                 return Ok(());

@@ -4,6 +4,7 @@ use crate::{
     checkpoint::{self, CheckpointError, Loaded},
     control_service::ControlService,
     coordinator::{Coordinator, Event},
+    episodes_service::EpisodesService,
     receive::receive,
     replay_log::{ReplayLog, ReplayLogError},
     rollout_service::RolloutService,
@@ -12,14 +13,20 @@ use crate::{
     writer::Writer,
 };
 use rit_algo::{ConfigError, Rit};
-use rit_config::{Config, RunDir};
+use rit_config::{Config, RunDir, Tls};
 use rit_env::Split;
 use rit_episode::wire::{Expected, PayloadLayout};
 use rit_ipc::{CreateError, EpisodeReceiver, Limits, ReceiveError, RunSpace, RunSpaceError};
 use rit_proto::{
     MESSAGE_BYTES_MAX,
-    transport::{Address, AddressError, Guard, Incoming, ListenError},
-    v1::{control_server::ControlServer, rollout_server::RolloutServer, weights_server::WeightsServer},
+    transport::{
+        Access, AccessError, AccessFiles, Address, AddressError, Incoming, ListenError, REQUEST_BYTES_MAX,
+        ServeLimits, serve,
+    },
+    v1::{
+        Welcome, control_server::ControlServer, episodes_server::EpisodesServer,
+        rollout_server::RolloutServer, weights_server::WeightsServer,
+    },
 };
 use std::{
     fs, io,
@@ -32,8 +39,11 @@ use std::{
     thread,
     time::Duration,
 };
-use tokio::sync::{mpsc as async_mpsc, oneshot};
-use tonic::{service::interceptor::InterceptedService, transport::Server};
+use tokio::{
+    sync::{mpsc as async_mpsc, oneshot, watch},
+    task::JoinSet,
+};
+use tonic::service::Routes;
 
 /// Events that may wait for the coordinator.
 const EVENT_QUEUE: usize = 1024;
@@ -47,6 +57,12 @@ pub enum LearnerError {
     /// The configuration names no address.
     #[error("learner.listen: {0}")]
     Address(#[from] AddressError),
+    /// It would let in whom it should not.
+    #[error(transparent)]
+    Access(#[from] AccessError),
+    /// The configuration cannot be told to actors.
+    #[error(transparent)]
+    Config(#[from] rit_config::ConfigError),
     /// It cannot listen.
     #[error(transparent)]
     Listen(#[from] ListenError),
@@ -71,9 +87,6 @@ pub enum LearnerError {
     /// Training failed.
     #[error(transparent)]
     Train(#[from] TrainError),
-    /// The services failed.
-    #[error("the gRPC services failed: {0}")]
-    Serve(#[from] tonic::transport::Error),
     /// A file of the run directory or a thread could not be had.
     #[error("{what}: {error}")]
     Io {
@@ -96,11 +109,7 @@ pub async fn run(
     config: Config,
     shutdown: impl Future<Output = ()>,
 ) -> Result<Summary, LearnerError> {
-    let address = match config.learner.listen.as_str() {
-        "unix" => Address::Unix(run_dir.socket()),
-        address => address.parse()?,
-    };
-    let incoming = Incoming::bind(&address).await?;
+    let doors = listen(&run_dir, &config).await?;
     let rit = Arc::new(Rit::new(config.rit())?);
     let expected = expected(&run_dir, &config);
     let space = RunSpace::new(&run_dir.shared_memory_root())?;
@@ -127,9 +136,12 @@ pub async fn run(
     let (trainer, board) =
         Trainer::new(config.clone(), run_dir.clone(), Arc::clone(&rit), loaded, news, to_write)?;
     let metrics = trainer.metrics_follower();
-    let coordinator = Coordinator::new(config.clone(), trainer.beginning(), work, fences);
+    let welcome = Welcome { actor: 0, run_id: run_dir.run_id().to_vec(), config: config.to_toml()? };
+    let coordinator = Coordinator::new(config.clone(), welcome, trainer.beginning(), work, fences);
 
     let stop = Arc::new(AtomicBool::new(false));
+    let expected = Arc::new(expected);
+    let episodes = EpisodesService { events: events.clone(), expected: Arc::clone(&expected) };
     let receiving = {
         let (events, stop) = (events.clone(), Arc::clone(&stop));
         spawn("receive", move || {
@@ -148,29 +160,36 @@ pub async fn run(
         })?
     };
 
-    let guard = Guard::new(run_dir.token());
-    let weights =
-        WeightsServer::new(WeightsService(Arc::clone(&board))).max_encoding_message_size(MESSAGE_BYTES_MAX);
+    let episode_bytes_max = episodes.message_bytes_max();
+    let weights = WeightsServer::new(WeightsService(Arc::clone(&board)));
     let control = ControlService::new(events.clone(), board, metrics, Arc::new(config), rit);
+    let rollout = RolloutServer::new(RolloutService(events.clone()));
     let (health_reporter, health) = tonic_health::server::health_reporter();
     health_reporter.set_serving::<WeightsServer<WeightsService>>().await;
     health_reporter.set_serving::<RolloutServer<RolloutService>>().await;
+    health_reporter.set_serving::<EpisodesServer<EpisodesService>>().await;
     health_reporter.set_serving::<ControlServer<ControlService>>().await;
-    write_address(&run_dir, &incoming)?;
-    let (close, closed) = oneshot::channel::<()>();
-    let server = Server::builder()
-        .add_service(health)
-        .add_service(InterceptedService::new(weights, guard.clone()))
-        .add_service(InterceptedService::new(
-            RolloutServer::new(RolloutService(events.clone())),
-            guard.clone(),
-        ))
-        .add_service(InterceptedService::new(ControlServer::new(control), guard))
-        .serve_with_incoming_shutdown(incoming, async {
-            let _ = closed.await;
-        });
-    let server = tokio::spawn(server);
-    tracing::info!(%address, "the learner listens");
+    let routes = Routes::new(health)
+        .add_service(
+            weights.max_decoding_message_size(REQUEST_BYTES_MAX).max_encoding_message_size(MESSAGE_BYTES_MAX),
+        )
+        .add_service(rollout.max_decoding_message_size(REQUEST_BYTES_MAX))
+        .add_service(EpisodesServer::new(episodes).max_decoding_message_size(episode_bytes_max))
+        .add_service(ControlServer::new(control).max_decoding_message_size(REQUEST_BYTES_MAX));
+    // What a learner that was killed has left; this one may not listen for other hosts.
+    let _ = fs::remove_file(run_dir.remote_address());
+    let (close, closed) = watch::channel(());
+    let mut servers = JoinSet::new();
+    for (incoming, access) in doors {
+        tell_address(&run_dir, incoming.address())?;
+        tracing::info!(address = %incoming.address(), ?access, "the learner listens");
+        let mut closed = closed.clone();
+        let closed = async move {
+            // Never a value: it changes by its end.
+            let _ = closed.changed().await;
+        };
+        servers.spawn(serve(incoming, access, ServeLimits::default(), routes.clone(), closed));
+    }
 
     let coordinating = coordinator.run(event_queue);
     tokio::pin!(coordinating, shutdown);
@@ -186,8 +205,16 @@ pub async fn run(
     stop.store(true, Ordering::Relaxed);
     drop(close);
     // Whoever still holds a connection open then has had its time.
-    let _ = tokio::time::timeout(CLOSE_TIMEOUT, server).await;
+    let closing = async {
+        while let Some(served) = servers.join_next().await {
+            if let Ok(Err(error)) = served {
+                tracing::error!(%error, "a gRPC server failed");
+            }
+        }
+    };
+    let _ = tokio::time::timeout(CLOSE_TIMEOUT, closing).await;
     let _ = fs::remove_file(run_dir.address());
+    let _ = fs::remove_file(run_dir.remote_address());
     receiving.await.map_err(|_| LearnerError::Panicked("receive"))??;
     if let Err(error) = space.remove() {
         tracing::warn!(%error, "something of the run is still in shared memory");
@@ -238,13 +265,33 @@ fn spawn<T: Send + 'static>(
     Ok(result)
 }
 
+/// Where the learner listens and what callers must show: the run directory's socket, and TCP if it is asked for.
+async fn listen(run_dir: &RunDir, config: &Config) -> Result<Vec<(Incoming, Access)>, LearnerError> {
+    let socket = Incoming::bind(&Address::Unix(run_dir.socket())).await?;
+    let mut doors = vec![(socket, Access::token(run_dir.token()))];
+    if config.learner.listen != "unix" {
+        let address: Address = config.learner.listen.parse()?;
+        let file = |path: &String| (!path.is_empty()).then(|| PathBuf::from(path));
+        let Tls { certificate, key, client_ca } = &config.learner.tls;
+        let files = AccessFiles {
+            token: file(&config.learner.token_file),
+            certificate: file(certificate),
+            key: file(key),
+            client_ca: file(client_ca),
+        };
+        let access = Access::over_tcp(&address, &files)?;
+        doors.push((Incoming::bind(&address).await?, access));
+    }
+    Ok(doors)
+}
+
 /// Tells whoever reads the run directory where the learner listens: renamed into place, so it is whole.
-fn write_address(run_dir: &RunDir, incoming: &Incoming) -> Result<(), LearnerError> {
-    let path = run_dir.address();
-    let partial: PathBuf = path.with_extension("partial");
-    let written = incoming.address().and_then(|address| {
-        fs::write(&partial, format!("{address}\n"))?;
-        fs::rename(&partial, &path)
-    });
+fn tell_address(run_dir: &RunDir, address: &Address) -> Result<(), LearnerError> {
+    let path = match address {
+        Address::Unix(_) => run_dir.address(),
+        Address::Tcp { .. } => run_dir.remote_address(),
+    };
+    let partial = path.with_extension("partial");
+    let written = fs::write(&partial, format!("{address}\n")).and_then(|()| fs::rename(&partial, &path));
     written.map_err(|error| LearnerError::Io { what: path.display().to_string(), error })
 }

@@ -1,5 +1,6 @@
 //! The resolved configuration: complete, and within its limits. `presets/all.toml` says what each key means.
 
+use crate::ConfigError;
 use rit_algo::{Mixing, RitConfig, TaskRepresentations, TerminalStates, UpdateConfig};
 use rit_env::{EnvironmentOptions, TaskSet};
 use rit_episode::RunSeed;
@@ -164,6 +165,7 @@ pub struct Checkpoints {
 #[allow(missing_docs, reason = "presets/all.toml documents every key, for users too")]
 pub struct Actors {
     pub count: usize,
+    pub remote: usize,
     pub episodes_at_once: usize,
     pub heartbeat_timeout_ms: u64,
 }
@@ -174,12 +176,32 @@ pub struct Actors {
 #[allow(missing_docs, reason = "presets/all.toml documents every key, for users too")]
 pub struct Learner {
     pub listen: String,
+    pub token_file: String,
+    pub tls: Tls,
     pub shards: usize,
     pub threads: usize,
     pub metrics_every_env_steps: u64,
 }
 
+/// `[learner.tls]`. An empty path is none.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs, reason = "presets/all.toml documents every key, for users too")]
+pub struct Tls {
+    pub certificate: String,
+    pub key: String,
+    pub client_ca: String,
+}
+
 impl Config {
+    /// The text that [`resolve`](crate::resolve) makes the same configuration of.
+    ///
+    /// # Errors
+    /// When TOML cannot say it.
+    pub fn to_toml(&self) -> Result<String, ConfigError> {
+        toml::to_string(self).map_err(|error| ConfigError::Value(error.to_string()))
+    }
+
     /// The model's sizes and parts.
     pub fn rit(&self) -> RitConfig {
         let (dims, network) = (self.environment.task_set.dims(), &self.network);
@@ -274,6 +296,7 @@ impl Config {
             ("checkpoints.every_env_steps", self.checkpoints.every_env_steps as f64, 1.0, STEPS),
             ("checkpoints.keep", self.checkpoints.keep as f64, 1.0, COUNT),
             ("actors.count", self.actors.count as f64, 0.0, 256.0),
+            ("actors.remote", self.actors.remote as f64, 0.0, 256.0),
             ("actors.episodes_at_once", self.actors.episodes_at_once as f64, 1.0, 4096.0),
             ("actors.heartbeat_timeout_ms", self.actors.heartbeat_timeout_ms as f64, 2000.0, 3_600_000.0),
             ("learner.shards", self.learner.shards as f64, 1.0, 256.0),

@@ -117,12 +117,14 @@ pub fn set(assignment: &str) -> Result<Table, ConfigError> {
 }
 
 /// Keys, or sections, that a run may change when it goes on: no weight follows from them.
-const FREE: [&str; 8] = [
+const FREE: [&str; 10] = [
     "training",
     "evaluation",
     "checkpoints",
     "actors",
     "learner.listen",
+    "learner.token_file",
+    "learner.tls",
     "learner.threads",
     "learner.metrics_every_env_steps",
     "learner.web",

@@ -160,9 +160,14 @@ impl RunDir {
         &self.token
     }
 
-    /// Where the learner listens: a line of text, there while it does.
+    /// Where the learner listens on this host: a line of text, there while it does.
     pub fn address(&self) -> PathBuf {
         self.root.join("address")
+    }
+
+    /// Where the learner listens for other hosts: likewise, if it does.
+    pub fn remote_address(&self) -> PathBuf {
+        self.root.join("remote_address")
     }
 
     /// The resolved configuration.

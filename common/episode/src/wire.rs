@@ -75,6 +75,21 @@ pub struct Header {
     pub reserved: [u8; 6],
 }
 
+impl Header {
+    /// A header that came as bytes, of any alignment. Nothing it says has been checked yet.
+    ///
+    /// # Errors
+    /// When they are not as many as a header has.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, Rejection> {
+        bytemuck::try_pod_read_unaligned(bytes).map_err(|_| Rejection::Header { found: bytes.len() })
+    }
+
+    /// Its bytes.
+    pub fn as_bytes(&self) -> &[u8] {
+        bytemuck::bytes_of(self)
+    }
+}
+
 // `Pod` already refuses padding between fields. A frame made by another build must mean the same.
 const _: () = assert!(size_of::<Header>() == 88);
 const _: () = assert!(align_of::<Header>() == ALIGNMENT);
@@ -252,6 +267,12 @@ pub struct Expected {
 /// Why a frame was refused.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Rejection {
+    /// Bytes that cannot be a header.
+    #[error("the frame's header has {found} bytes, {} were expected", size_of::<Header>())]
+    Header {
+        /// Bytes found.
+        found: usize,
+    },
     /// Not one of our frames.
     #[error("the frame does not begin with RITEPSD")]
     Magic,
@@ -331,6 +352,7 @@ impl Rejection {
     /// A short name for counting.
     pub fn reason(&self) -> &'static str {
         match self {
+            Self::Header { .. } => "header",
             Self::Magic => "magic",
             Self::LayoutVersion { .. } => "layout_version",
             Self::Run => "run",

@@ -48,6 +48,7 @@
 //! | a learner killed while it creates the service makes it impossible to create | a lock tells that nobody is at it, and the half is removed |
 //! | a reaper killed at its work may leave a place taken for ever | the learner's place: [`CreateError::StalePlace`]; an actor's: there are some to spare |
 //! | a slice of bytes aligned to 8 takes eight times its length | the payload is a slice of words |
+//! | the first node makes a segment that every user may write to | it is closed to others at once, `shared_memory` |
 //! | long paths fail with an opaque error or a panic | [`RunSpace::new`] checks the length |
 //! | an event's notification may be swallowed, and wakes cost twice as much | the wake-up is a futex of our own, see `bell` |
 

@@ -1,6 +1,6 @@
 //! What both ends share of iceoryx2: the node a process is known by, the service, and the removal of the dead.
 
-use crate::RunSpace;
+use crate::{RunSpace, shared_memory};
 use iceoryx2::config::Config;
 use iceoryx2::node::{DeadNodeView, NodeView as _};
 use iceoryx2::prelude::*;
@@ -69,13 +69,17 @@ pub(crate) fn create_node(space: &RunSpace, role: Role) -> Result<Node<Service>,
     LOG_LEVEL.call_once(|| set_log_level_from_env_or(LogLevel::Error));
 
     let name = NodeName::new(role.name()).map_err(|error| IceoryxError::new("naming a node", error))?;
-    NodeBuilder::new()
+    let node = NodeBuilder::new()
         .name(&name)
         .config(space.config())
         // Signals are tokio's.
         .signal_handling_mode(SignalHandlingMode::Disabled)
         .create()
-        .map_err(|error| IceoryxError::new("creating a node", error))
+        .map_err(|error| IceoryxError::new("creating a node", error))?;
+    // The first node of a run makes a segment that everybody may write to, whatever the umask.
+    shared_memory::make_private(space.prefix())
+        .map_err(|error| IceoryxError::new("keeping others out of shared memory", error))?;
+    Ok(node)
 }
 
 /// The service, to be created by the learner and opened by actors.

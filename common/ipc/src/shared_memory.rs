@@ -3,7 +3,9 @@
 
 use rustix::fs::{FallocateFlags, Mode, OFlags, StatVfs};
 use rustix::io::Errno;
-use std::os::unix::fs::MetadataExt as _;
+use std::fs::Permissions;
+use std::io::ErrorKind;
+use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
 use std::path::PathBuf;
 
 /// Where segments lie.
@@ -59,6 +61,24 @@ pub(crate) fn segments(prefix: &str) -> std::io::Result<Vec<PathBuf>> {
         }
     }
     Ok(found)
+}
+
+/// Takes all rights on the files with this prefix from everybody but their user.
+pub(crate) fn make_private(prefix: &str) -> std::io::Result<()> {
+    for segment in segments(prefix)? {
+        let closed = segment.metadata().and_then(|metadata| {
+            if metadata.mode() & 0o077 == 0 {
+                return Ok(());
+            }
+            std::fs::set_permissions(&segment, Permissions::from_mode(0o600))
+        });
+        match closed {
+            // Gone in the meantime is as good.
+            Err(error) if error.kind() == ErrorKind::NotFound => {}
+            closed => closed?,
+        }
+    }
+    Ok(())
 }
 
 /// Bytes that the files with this prefix have taken already.

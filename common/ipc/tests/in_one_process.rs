@@ -45,6 +45,24 @@ fn an_episode_comes_out_as_it_went_in() {
 }
 
 #[test]
+fn nobody_else_may_look_into_shared_memory() {
+    let run = Run::new();
+    let mut receiver = run.receiver(limits(1, 2));
+    let mut sender = run.sender();
+    sender.send(&frame(1, 2), &never).unwrap();
+    next(&mut receiver);
+    let files = run.space.leftovers().unwrap();
+    // At least a data segment, the bell, and the one that iceoryx2 would leave open.
+    assert!(files.iter().filter(|path| path.starts_with("/dev/shm")).count() >= 3, "{files:?}");
+    for path in files.iter().filter(|path| path.starts_with("/dev/shm")) {
+        let mode = std::fs::metadata(path).unwrap().permissions().mode() & 0o777;
+        assert_eq!(mode, 0o600, "{} has mode {mode:o}", path.display());
+    }
+    let folder = std::fs::metadata(run.space.directory()).unwrap().permissions().mode() & 0o777;
+    assert_eq!(folder, 0o700, "what lies in it is out of others' reach");
+}
+
+#[test]
 fn many_frames_through_few_places_arrive_whole_and_in_each_senders_order() {
     const SENDERS: u32 = 3;
     const FRAMES: u64 = 400;

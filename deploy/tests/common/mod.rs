@@ -4,7 +4,8 @@
 use rustix::process::{Pid, Signal, kill_process, test_kill_process};
 use serde_json::Value;
 use std::{
-    fs,
+    fs::{self, Permissions},
+    os::unix::fs::PermissionsExt as _,
     path::{Path, PathBuf},
     process::{Child, Command, Output, Stdio},
     time::{Duration, Instant},
@@ -59,6 +60,26 @@ impl RunFolder {
         self.folder.path()
     }
 
+    /// A file of mode 600 with a token.
+    pub fn secret(&self, name: &str) -> PathBuf {
+        let path = self.path().join(name);
+        fs::write(&path, format!("{name}-0123456789abcdef\n")).unwrap();
+        fs::set_permissions(&path, Permissions::from_mode(0o600)).unwrap();
+        path
+    }
+
+    /// Where the learner of this run listens for other hosts, once it does.
+    pub fn remote_address(&self) -> String {
+        let begun = Instant::now();
+        loop {
+            if let Ok(address) = fs::read_to_string(self.run_dir().join("remote_address")) {
+                return address.trim().to_owned();
+            }
+            assert!(begun.elapsed() < DEADLINE, "no learner listens");
+            std::thread::yield_now();
+        }
+    }
+
     /// Trains to the end and returns the summary.
     pub fn train(&self, arguments: &[&str]) -> Value {
         self.start(arguments).finish()
@@ -66,8 +87,13 @@ impl RunFolder {
 
     /// Starts to train.
     pub fn start(&self, arguments: &[&str]) -> Train {
+        self.start_as(rit(&[]), arguments)
+    }
+
+    /// Starts to train by a command that executes `rit`.
+    pub fn start_as(&self, mut command: Command, arguments: &[&str]) -> Train {
         let run_dir = self.run_dir();
-        let mut command = rit(&["train", "--json", "--run-dir", run_dir.to_str().unwrap()]);
+        command.args(["train", "--json", "--run-dir", run_dir.to_str().unwrap()]);
         let child = command.args(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
         Train { child: Some(child), run_dir }
     }

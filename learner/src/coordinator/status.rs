@@ -59,6 +59,7 @@ impl Coordinator {
             outstanding: self.ledger.outstanding_with(id).count() as u64,
             silent_s: (now - actor.heard).as_secs_f64(),
             hung: actor.hung,
+            remote: actor.remote,
             waiting_s: actor.waiting.seconds(now),
         }
     }

@@ -151,3 +151,12 @@ fn each_fault_has_its_name() {
     let broken = Header { checksum: !good.header.checksum, ..good.header };
     assert_eq!(reason(decode(&broken, &good.payload, &expected())), Err("checksum"));
 }
+
+#[test]
+fn a_header_comes_as_bytes_of_any_alignment() {
+    let header = frame(&episode(0, 6, 1)).header;
+    let shifted = [&[0], header.as_bytes()].concat();
+    assert_eq!(Header::from_bytes(&shifted[1..]), Ok(header));
+    assert_eq!(Header::from_bytes(&shifted), Err(Rejection::Header { found: 89 }));
+    assert_eq!(Header::from_bytes(&[]).unwrap_err().reason(), "header");
+}

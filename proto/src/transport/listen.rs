@@ -1,0 +1,320 @@
+//! Listening sockets, and which connections are let in.
+
+use super::{Address, CONNECT_TIMEOUT};
+use std::{
+    collections::BTreeSet,
+    convert::Infallible,
+    fs,
+    io::{self, ErrorKind},
+    net::IpAddr,
+    os::unix::fs::{FileTypeExt as _, PermissionsExt as _},
+    path::{Path, PathBuf},
+    pin::Pin,
+    sync::Arc,
+    task::{Context, Poll},
+    time::Duration,
+};
+use tokio::{
+    io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, ReadBuf},
+    net::{TcpListener, TcpStream, UnixListener, UnixStream},
+    sync::{OwnedSemaphorePermit, Semaphore, mpsc},
+    task::JoinSet,
+};
+use tokio_rustls::{TlsAcceptor, server::TlsStream};
+use tonic::transport::server::Connected;
+
+/// Longest path of a Unix socket: `sun_path` holds 108 bytes, the last of them zero.
+const SOCKET_PATH_MAX: usize = 107;
+
+/// How long nothing is accepted after the system could not: without a pause, running out of files would take all CPU
+/// time too.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+
+/// Refusals that are remembered as logged.
+const LOGGED_MAX: usize = 1000;
+
+/// Bytes of a refused caller that are still read, so that the refusal reaches it.
+const LINGER_BYTES: usize = 64 << 10;
+
+/// Why a learner cannot listen.
+#[derive(Debug, thiserror::Error)]
+pub enum ListenError {
+    /// Somebody answers there.
+    #[error("{0} is in use: another learner listens there; choose another run directory or address")]
+    InUse(Address),
+    /// The socket's path does not fit.
+    #[error(
+        "the socket's path {path} has {len} bytes, at most {SOCKET_PATH_MAX} fit; choose a shorter run directory"
+    )]
+    PathTooLong {
+        /// The path.
+        path: PathBuf,
+        /// Its length.
+        len: usize,
+    },
+    /// Something else than a socket lies at the path.
+    #[error("{0} is not a socket; move it away")]
+    NotASocket(PathBuf),
+    /// A name, which may mean several addresses.
+    #[error("{0}: a learner listens on an IP address, such as tcp:127.0.0.1:50051")]
+    NotAnIp(Address),
+    /// The system refused.
+    #[error("cannot listen on {address}: {error}")]
+    Io {
+        /// Where.
+        address: Address,
+        /// Why.
+        error: io::Error,
+    },
+}
+
+/// Why a connection was not let in.
+#[derive(Debug, thiserror::Error)]
+pub enum Refused {
+    /// A process of somebody else.
+    #[error("it comes from user {0}, and this learner belongs to another")]
+    OtherUser(u32),
+    /// The system does not say whose it is.
+    #[error("the system does not say whose it is: {0}")]
+    UnknownUser(io::Error),
+    /// All places are taken.
+    #[error("{0} connections are open, which is the most there may be")]
+    TooMany(usize),
+    /// No TLS, or a certificate that does not do.
+    #[error("{ip}: {error}")]
+    Tls {
+        /// Who called.
+        ip: IpAddr,
+        /// What was wrong.
+        error: io::Error,
+    },
+    /// The TLS handshake took too long.
+    #[error("{0} did not finish its TLS handshake in {CONNECT_TIMEOUT:?}")]
+    Slow(IpAddr),
+}
+
+/// A listening socket.
+#[derive(Debug)]
+pub struct Incoming {
+    socket: Socket,
+    address: Address,
+}
+
+#[derive(Debug)]
+enum Socket {
+    Unix(UnixListener),
+    Tcp(TcpListener),
+}
+
+impl Incoming {
+    /// Listens. A socket file that a dead learner has left is replaced.
+    ///
+    /// # Errors
+    /// When somebody listens there already, or the system refuses.
+    pub async fn bind(address: &Address) -> Result<Self, ListenError> {
+        match address {
+            Address::Unix(path) => Self::bind_unix(path).await,
+            Address::Tcp { host, port } => {
+                let ip: IpAddr = host.parse().map_err(|_| ListenError::NotAnIp(address.clone()))?;
+                let io = |error: io::Error| match error.kind() {
+                    ErrorKind::AddrInUse => ListenError::InUse(address.clone()),
+                    _ => ListenError::Io { address: address.clone(), error },
+                };
+                let listener = TcpListener::bind((ip, *port)).await.map_err(io)?;
+                // With a port of 0: the one that was chosen.
+                let port = listener.local_addr().map_err(io)?.port();
+                let address = Address::Tcp { host: host.clone(), port };
+                Ok(Self { socket: Socket::Tcp(listener), address })
+            }
+        }
+    }
+
+    async fn bind_unix(path: &Path) -> Result<Self, ListenError> {
+        let address = Address::Unix(path.to_owned());
+        let io = |error| ListenError::Io { address: address.clone(), error };
+        let len = path.as_os_str().len();
+        if len > SOCKET_PATH_MAX {
+            return Err(ListenError::PathTooLong { path: path.to_owned(), len });
+        }
+        match fs::symlink_metadata(path) {
+            Err(error) if error.kind() == ErrorKind::NotFound => {}
+            Err(error) => return Err(io(error)),
+            Ok(metadata) if !metadata.file_type().is_socket() => {
+                return Err(ListenError::NotASocket(path.to_owned()));
+            }
+            Ok(_) if UnixStream::connect(path).await.is_ok() => return Err(ListenError::InUse(address)),
+            // Nobody answers: its learner is dead.
+            Ok(_) => fs::remove_file(path).map_err(io)?,
+        }
+        let listener = UnixListener::bind(path).map_err(io)?;
+        fs::set_permissions(path, fs::Permissions::from_mode(0o600)).map_err(io)?;
+        Ok(Self { socket: Socket::Unix(listener), address })
+    }
+
+    /// Where it listens: with a TCP port of 0, the one that was chosen.
+    pub fn address(&self) -> &Address {
+        &self.address
+    }
+
+    /// Passes on the connections that are let in, at most so many at a time. Each refusal is logged once, however
+    /// often the same caller comes.
+    pub(super) async fn accept(
+        &self,
+        tls: Option<&TlsAcceptor>,
+        connections_max: usize,
+        connections: &mpsc::Sender<io::Result<Connection>>,
+    ) -> Infallible {
+        let places = Arc::new(Semaphore::new(connections_max));
+        let mut handshakes = JoinSet::new();
+        let mut logged = BTreeSet::new();
+        loop {
+            let let_in = tokio::select! {
+                accepted = self.next() => match accepted {
+                    Ok((io, ip)) => match (io, Arc::clone(&places).try_acquire_owned(), tls) {
+                        (Err(refused), ..) => Err(refused),
+                        (_, Err(_), _) => Err(Refused::TooMany(connections_max)),
+                        (Ok(Io::Tcp(stream)), Ok(place), Some(tls)) => {
+                            handshakes.spawn(handshake(stream, ip, tls.clone(), place));
+                            continue;
+                        }
+                        (Ok(io), Ok(place), _) => Ok(Connection { io, _place: place }),
+                    },
+                    Err(error) => {
+                        if logged.insert(error.to_string()) {
+                            tracing::error!(%error, address = %self.address, "cannot accept connections");
+                        }
+                        tokio::time::sleep(ACCEPT_PAUSE).await;
+                        continue;
+                    }
+                },
+                // A handshake that panicked is a connection that is closed.
+                Some(Ok(greeted)) = handshakes.join_next() => greeted,
+            };
+            match let_in {
+                Ok(connection) => {
+                    // Nobody takes connections any more: the server is about to end.
+                    let _ = connections.send(Ok(connection)).await;
+                }
+                Err(refused) => {
+                    if logged.len() >= LOGGED_MAX {
+                        logged.clear();
+                    }
+                    if logged.insert(refused.to_string()) {
+                        tracing::warn!(%refused, address = %self.address, "refused a connection");
+                    }
+                }
+            }
+        }
+    }
+
+    /// The next caller: whether it may be heard, and, over TCP, from where it calls.
+    async fn next(&self) -> io::Result<(Result<Io, Refused>, IpAddr)> {
+        let here = IpAddr::from([127, 0, 0, 1]);
+        Ok(match &self.socket {
+            Socket::Unix(listener) => {
+                let (stream, _) = listener.accept().await?;
+                (check_user(&stream).map(|()| Io::Unix(stream)), here)
+            }
+            Socket::Tcp(listener) => {
+                let (stream, from) = listener.accept().await?;
+                stream.set_nodelay(true)?;
+                (Ok(Io::Tcp(stream)), from.ip().to_canonical())
+            }
+        })
+    }
+}
+
+impl Drop for Incoming {
+    fn drop(&mut self) {
+        if let Address::Unix(path) = &self.address {
+            // Gone already is as good.
+            let _ = fs::remove_file(path);
+        }
+    }
+}
+
+/// Whether a process of the same user calls.
+fn check_user(stream: &UnixStream) -> Result<(), Refused> {
+    let peer = stream.peer_cred().map_err(Refused::UnknownUser)?;
+    if peer.uid() == rustix::process::geteuid().as_raw() {
+        Ok(())
+    } else {
+        Err(Refused::OtherUser(peer.uid()))
+    }
+}
+
+async fn handshake(
+    stream: TcpStream,
+    ip: IpAddr,
+    tls: TlsAcceptor,
+    place: OwnedSemaphorePermit,
+) -> Result<Connection, Refused> {
+    let greeted = tokio::time::timeout(CONNECT_TIMEOUT, tls.accept(stream).into_fallible()).await;
+    match greeted.map_err(|_| Refused::Slow(ip))? {
+        Ok(stream) => Ok(Connection { io: Io::Tls(Box::new(stream)), _place: place }),
+        Err((error, mut stream)) => {
+            // Closed with unread bytes, the connection would be reset, and the caller would not learn why.
+            let _ = stream.shutdown().await;
+            let mut rest = vec![0; LINGER_BYTES];
+            let _ = tokio::time::timeout(CONNECT_TIMEOUT, stream.read(&mut rest)).await;
+            Err(Refused::Tls { ip, error })
+        }
+    }
+}
+
+/// A connection that was let in; it has one of the places until it is dropped.
+pub(super) struct Connection {
+    io: Io,
+    _place: OwnedSemaphorePermit,
+}
+
+enum Io {
+    Unix(UnixStream),
+    Tcp(TcpStream),
+    Tls(Box<TlsStream<TcpStream>>),
+}
+
+/// What both directions need: the stream inside, pinned.
+trait ReadWrite: AsyncRead + AsyncWrite + Unpin {}
+impl<T: AsyncRead + AsyncWrite + Unpin> ReadWrite for T {}
+
+impl Connection {
+    fn stream(self: Pin<&mut Self>) -> Pin<&mut dyn ReadWrite> {
+        let stream: &mut dyn ReadWrite = match &mut self.get_mut().io {
+            Io::Unix(stream) => stream,
+            Io::Tcp(stream) => stream,
+            Io::Tls(stream) => stream,
+        };
+        Pin::new(stream)
+    }
+}
+
+impl Connected for Connection {
+    type ConnectInfo = ();
+
+    fn connect_info(&self) {}
+}
+
+impl AsyncRead for Connection {
+    fn poll_read(
+        self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        self.stream().poll_read(cx, buffer)
+    }
+}
+
+impl AsyncWrite for Connection {
+    fn poll_write(self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        self.stream().poll_write(cx, bytes)
+    }
+
+    fn poll_flush(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        self.stream().poll_flush(cx)
+    }
+
+    fn poll_shutdown(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        self.stream().poll_shutdown(cx)
+    }
+}

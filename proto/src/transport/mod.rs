@@ -1,0 +1,44 @@
+//! Addresses, and how to listen and connect, so that nobody gets in who should not.
+//!
+//! A Unix socket in the run directory is always there: its folder has mode 700, it has mode 600 itself, the system is
+//! asked who calls, and the caller must know the run's token. TCP is there when somebody asks for it, and then:
+//!
+//! | listens on | what callers must show |
+//! |---|---|
+//! | any address | a certificate of the client authority (mTLS), or a token inside TLS, or both |
+//! | loopback | the same, or a token without TLS |
+//!
+//! A token in clear text over a network would be no secret, so neither side ever sends or takes one there.
+
+mod access;
+mod address;
+mod connect;
+mod files;
+mod listen;
+mod serve;
+#[cfg(test)]
+mod tests;
+
+pub use access::{Access, AccessError, AccessFiles};
+pub use address::{Address, AddressError};
+pub use connect::{Client, ConnectError, CredentialFiles, Credentials, CredentialsError, connect};
+pub use files::{FileError, check_private};
+pub use listen::{Incoming, ListenError};
+pub use serve::{CONNECTIONS_MAX, REQUEST_BYTES_MAX, ServeLimits, serve};
+
+use std::time::Duration;
+
+/// How long connecting, and greeting whoever connects, may take.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// How long most calls may take: their answers are at hand.
+const CALL_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// How long a call may take that works: an evaluation, a checkpoint.
+const LONG_CALL_TIMEOUT: Duration = Duration::from_secs(600);
+
+/// Without a word from the other side for so long, it is pinged.
+const KEEPALIVE_EVERY: Duration = Duration::from_secs(5);
+
+/// Without an answer to that for so long, the link is dead. Longer than a slow link needs for what is before the ping.
+const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
