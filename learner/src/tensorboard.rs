@@ -115,7 +115,7 @@ fn masked_crc(data: &[u8]) -> [u8; 4] {
 
 fn summary(line: &Line) -> Summary {
     let mut value = Vec::new();
-    let mut scalar = |tag: String, number: f64| value.push(Value { tag, simple_value: number as f32 });
+    let mut scalar = |tag: String, number: f64| value.push(Value { tag, simple_value: Some(number as f32) });
     let (group, tasks): (&str, &BTreeMap<String, TaskResult>) = match line {
         Line::Training { epsilon, losses, tasks, progress, .. } => {
             for (tag, number) in [
@@ -178,8 +178,9 @@ struct Summary {
 struct Value {
     #[prost(string, tag = "1")]
     tag: String,
-    #[prost(float, tag = "2")]
-    simple_value: f32,
+    /// Part of a oneof: a zero that is left out would be no value.
+    #[prost(float, optional, tag = "2")]
+    simple_value: Option<f32>,
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -228,7 +229,7 @@ mod tests {
         let mut scalars = Vec::new();
         for event in events {
             if let Some(What::Summary(summary)) = &event.what {
-                let of = |value: &Value| (event.step, value.tag.clone(), value.simple_value);
+                let of = |value: &Value| (event.step, value.tag.clone(), value.simple_value.unwrap());
                 scalars.extend(summary.value.iter().map(of));
             }
         }
@@ -269,7 +270,7 @@ mod tests {
             td_loss: 0.5,
             contrastive_loss: 0.25,
             grad_norm: 3.0,
-            q_total_mean: -1.0,
+            q_total_mean: 0.0,
             target_mean: -1.5,
         };
         let exploring = Some(Exploring { episodes_total: 9, policy_lag: 1 });
@@ -288,7 +289,7 @@ mod tests {
             (100, "training/td_loss", 0.5),
             (100, "training/contrastive_loss", 0.25),
             (100, "training/grad_norm", 3.0),
-            (100, "training/q_total_mean", -1.0),
+            (100, "training/q_total_mean", 0.0),
             (100, "training/target_mean", -1.5),
             (100, "training/epsilon", 0.125),
             (100, "training/episodes", 40.0),
