@@ -29,6 +29,8 @@ pub enum Command {
     Render(RenderOptions),
     /// Ask something of a running learner
     Ctl(CtlOptions),
+    /// Watch a run in the terminal; q or Ctrl-C ends the view, not the run
+    Watch(WatchOptions),
     /// Kill a run's processes at random moments, and hold its end to that of an undisturbed run
     Soak(SoakOptions),
     /// Measure a part beside the machine's limit
@@ -266,6 +268,13 @@ pub struct PlotOptions {
     /// Draw a dashed line at this return, for comparison
     #[arg(long, value_name = "RETURN", allow_negative_numbers = true)]
     pub line: Option<f64>,
+}
+
+#[derive(Args, Debug)]
+pub struct WatchOptions {
+    /// Run directory
+    #[arg(long, value_name = "DIR")]
+    pub run: PathBuf,
 }
 
 #[derive(Args, Debug)]

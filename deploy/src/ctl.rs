@@ -105,8 +105,9 @@ fn status(status: &RunStatus, as_json: bool) -> Result<String, Failure> {
     if as_json {
         return json(status);
     }
-    let state = status.state().as_str_name().trim_start_matches("RUN_STATE_").to_lowercase();
-    let grouped = report::grouped;
+    let (state, grouped) = (report::state(status), report::grouped);
+    let rates = status.rates.unwrap_or_default();
+    let actors_waited: f64 = status.actors.iter().map(|actor| actor.waiting_s).sum();
     let mut lines = vec![
         format!("{state} for {}", report::duration(status.wall_s)),
         format!("environment steps  {} of {}", grouped(status.env_steps), grouped(status.env_steps_max)),
@@ -116,6 +117,15 @@ fn status(status: &RunStatus, as_json: bool) -> Result<String, Failure> {
             grouped(status.replay_episodes)
         ),
         format!("updates            {}", grouped(status.updates)),
+        format!(
+            "rates              {:.0} steps/s, {:.0} updates/s",
+            rates.env_steps_per_s, rates.updates_per_s
+        ),
+        format!(
+            "waited             learner {}, actors {}",
+            report::duration(status.learner_waiting_s),
+            report::duration(actors_waited)
+        ),
         format!("epsilon            {:.3}", status.epsilon),
         format!(
             "losses             TD {:.4}, contrastive {:.4}, gradient norm {:.4}",

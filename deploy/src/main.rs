@@ -20,6 +20,7 @@ mod shutdown;
 mod soak;
 mod supervisor;
 mod train;
+mod watch;
 
 use clap::{CommandFactory as _, Parser as _};
 use cli::{Cli, Command};
@@ -53,6 +54,7 @@ async fn run(cli: Cli) -> Result<ExitCode, Failure> {
         Command::Evaluate(options) => evaluate::run(&options),
         Command::Render(options) => render::run(&options),
         Command::Ctl(options) => ctl::run(options).await,
+        Command::Watch(options) => watch::run(&options).await,
         Command::Soak(options) => soak::run(options).await,
         Command::Bench(options) => bench::run(&options),
         Command::Plot(options) => plot::run(&options),

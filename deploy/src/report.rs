@@ -1,6 +1,6 @@
 //! Results as people read them.
 
-use rit_proto::v1::{MetricsLine, TaskResult};
+use rit_proto::v1::{MetricsLine, RunState, RunStatus, TaskResult};
 use std::fmt::Write as _;
 
 /// One line a task: name, mean return, win rate where there is one.
@@ -44,6 +44,43 @@ pub fn in_words(results: &[TaskResult]) -> Option<String> {
         Some(wins) => format!("return {mean:.1}, win rate {:.2}", wins / count),
         None => format!("return {mean:.1}"),
     })
+}
+
+/// A run's state in a word.
+pub fn state(status: &RunStatus) -> &'static str {
+    match status.state() {
+        RunState::Running => "running",
+        RunState::Paused => "paused",
+        RunState::Stopping => "ending",
+        RunState::Unspecified => "unknown",
+    }
+}
+
+/// How a run stands, in a line.
+pub fn status_line(status: &RunStatus) -> String {
+    let mut parts = vec![
+        format!("{} of {} steps", grouped(status.env_steps), grouped(status.env_steps_max)),
+        format!("{} updates", grouped(status.updates)),
+    ];
+    parts.extend(in_words(&status.recent));
+    if let Some(words) = status.evaluation.as_ref().and_then(|evaluation| in_words(&evaluation.tasks)) {
+        parts.push(format!("greedy: {words}"));
+    }
+    if let Some(rates) = &status.rates {
+        parts.push(format!("{:.0} steps/s, {:.0} updates/s", rates.env_steps_per_s, rates.updates_per_s));
+    }
+    parts.extend(time_left(status).map(|left| format!("{left} left")));
+    if status.state() != RunState::Running {
+        parts.push(state(status).to_owned());
+    }
+    parts.join(" · ")
+}
+
+/// How long a run will yet take at its present rate.
+pub fn time_left(status: &RunStatus) -> Option<String> {
+    let rate = status.rates.as_ref()?.env_steps_per_s;
+    let left = status.env_steps_max.saturating_sub(status.env_steps) as f64;
+    (rate > 0.5).then(|| duration(left / rate))
 }
 
 /// A line of metrics in words.

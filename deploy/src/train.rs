@@ -309,7 +309,7 @@ fn remove_shared_memory(run_dir: &RunDir) {
 
 /// Prints what `summary.json` says.
 #[allow(clippy::print_stdout, reason = "what the command is for")]
-fn print_summary(run_dir: &RunDir, json: bool) -> Result<(), Failure> {
+pub fn print_summary(run_dir: &RunDir, json: bool) -> Result<(), Failure> {
     let path = run_dir.summary();
     let text = fs::read_to_string(&path).map_err(Failure::runtime)?;
     if json {

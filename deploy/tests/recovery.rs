@@ -43,6 +43,23 @@ fn metrics(folder: &RunFolder) -> Vec<Value> {
     lines
 }
 
+/// Events in TensorBoard's files but for the two that each file begins with.
+fn tensorboard_events(folder: &RunFolder) -> usize {
+    let files = fs::read_dir(folder.run_dir().join("tensorboard")).unwrap();
+    files.map(|file| count_records(&fs::read(file.unwrap().path()).unwrap()) - 2).sum()
+}
+
+/// Records of a length, its checksum, data, its checksum.
+fn count_records(mut bytes: &[u8]) -> usize {
+    let mut count = 0;
+    while let Some((len, _)) = bytes.split_first_chunk::<8>() {
+        bytes = &bytes[8 + 4 + u64::from_le_bytes(*len) as usize + 4..];
+        count += 1;
+    }
+    assert!(bytes.is_empty(), "whole records");
+    count
+}
+
 /// Holds the end of a run to the undisturbed one: weights, evaluation, episodes and every line of the metrics.
 #[track_caller]
 fn nothing_was_lost(folder: &RunFolder, summary: &Value) {
@@ -54,6 +71,7 @@ fn nothing_was_lost(folder: &RunFolder, summary: &Value) {
         assert_eq!(line, expected);
     }
     assert_eq!(metrics(folder).len(), lines.len());
+    assert_eq!(tensorboard_events(folder), lines.len(), "each line once for TensorBoard too");
     assert!(shared_memory_of(&folder.run_dir()).is_empty());
 }
 
