@@ -13,7 +13,7 @@ use rit_env::{
 };
 use rit_episode::wire::{self, Frame, PayloadLayout};
 use rit_proto::{
-    transport::{CredentialFiles, Credentials, connect},
+    transport::{Client, CredentialFiles, Credentials, connect},
     v1::{
         self, actor_message::Message as Said, episodes_client::EpisodesClient,
         learner_message::Message as Heard, rollout_client::RolloutClient,
@@ -34,6 +34,7 @@ use std::{
 };
 use tokio::sync::mpsc;
 use tokio_stream::{StreamExt as _, wrappers::ReceiverStream};
+use tonic::{Code, Status, Streaming};
 
 /// 150 episodes, of which the last 118 bring an update each.
 const RUN: &[&str] = &["matrix-game", "--seed", "3", "--steps", "300"];
@@ -298,27 +299,70 @@ fn a_link_that_breaks_in_the_middle_of_frames_loses_and_doubles_nothing() {
     drop(actor);
 }
 
-/// An actor of the test's own, which sends what no actor of ours would.
+/// What an actor of the test's own hears from the learner, and how it speaks to it.
+struct Conversation {
+    to_learner: mpsc::Sender<v1::ActorMessage>,
+    from_learner: Streaming<v1::LearnerMessage>,
+}
+
+impl Conversation {
+    /// Says Hello as the process with this number.
+    async fn join(client: Client, instance: u64) -> Result<Self, Status> {
+        let (to_learner, messages) = mpsc::channel(8);
+        let hello = v1::Hello {
+            name: "forger".into(),
+            layout_version: wire::LAYOUT_VERSION,
+            instance,
+            remote: true,
+            ..v1::Hello::default()
+        };
+        to_learner.send(v1::ActorMessage { message: Some(Said::Hello(hello)) }).await.unwrap();
+        let from_learner = RolloutClient::new(client).join(ReceiverStream::new(messages)).await?.into_inner();
+        Ok(Self { to_learner, from_learner })
+    }
+
+    async fn hear(&mut self) -> Option<Heard> {
+        self.from_learner.message().await.unwrap().map(|message| message.message.unwrap())
+    }
+}
+
+async fn call(folder: &RunFolder, token: String) -> Client {
+    let address = folder.remote_address().parse().unwrap();
+    let token = CredentialFiles { token: Some(token.into()), ..CredentialFiles::default() };
+    connect(&address, &Credentials::read(&token).unwrap()).await.unwrap()
+}
+
+#[tokio::test]
+async fn an_actor_that_comes_back_takes_its_place_over() {
+    let folder = RunFolder::new();
+    let (mut train, token) = on_loopback(&folder);
+    let client = call(&folder, token).await;
+    let mut first = Conversation::join(client.clone(), 7).await.unwrap();
+    let Some(Heard::Welcome(v1::Welcome { actor, .. })) = first.hear().await else { panic!("no welcome") };
+    let Some(Heard::Lease(lease)) = first.hear().await else { panic!("no lease") };
+    // Of the same name, and another process; then the same process, of whose broken link the learner knows nothing.
+    let other = Conversation::join(client.clone(), 8).await.err().unwrap();
+    assert!(matches!(other.code(), Code::AlreadyExists | Code::FailedPrecondition), "{other}");
+    let mut again = Conversation::join(client, 7).await.unwrap();
+    let Some(Heard::Welcome(welcome)) = again.hear().await else { panic!("no welcome") };
+    assert_ne!(welcome.actor, actor);
+    let Some(Heard::Lease(same)) = again.hear().await else { panic!("no lease") };
+    assert_eq!(same.episodes, lease.episodes, "what it had is handed out again");
+    assert!(first.hear().await.is_none(), "its former session is over");
+    let status = train.wait_for("one actor", |status| status["actors"].as_array().unwrap().len() == 1);
+    assert_eq!(status["ledger"]["rejected"]["actor_gone"], Value::from(lease.episodes.len()));
+    balanced(&status);
+    drop((first.to_learner, again.to_learner));
+}
+
 #[tokio::test]
 async fn what_comes_twice_or_is_forged_is_counted_and_not_let_in() {
     let folder = RunFolder::new();
     let (mut train, token) = on_loopback(&folder);
-    let address = folder.remote_address().parse().unwrap();
-    let token = CredentialFiles { token: Some(token.into()), ..CredentialFiles::default() };
-    let client = connect(&address, &Credentials::read(&token).unwrap()).await.unwrap();
-    let (to_learner, messages) = mpsc::channel(8);
-    let hello = v1::Hello {
-        name: "forger".into(),
-        layout_version: wire::LAYOUT_VERSION,
-        remote: true,
-        ..v1::Hello::default()
-    };
-    to_learner.send(v1::ActorMessage { message: Some(Said::Hello(hello)) }).await.unwrap();
-    let join = RolloutClient::new(client.clone()).join(ReceiverStream::new(messages)).await;
-    let mut from_learner = join.unwrap().into_inner();
-    let mut heard = async || from_learner.message().await.unwrap().unwrap().message.unwrap();
-    let Heard::Welcome(welcome) = heard().await else { panic!("no welcome") };
-    let Heard::Lease(lease) = heard().await else { panic!("no lease") };
+    let client = call(&folder, token).await;
+    let mut actor = Conversation::join(client.clone(), 7).await.unwrap();
+    let Some(Heard::Welcome(welcome)) = actor.hear().await else { panic!("no welcome") };
+    let Some(Heard::Lease(lease)) = actor.hear().await else { panic!("no lease") };
 
     let config = rit_config::resolve(&welcome.config, "welcome", &[]).unwrap();
     let layout = PayloadLayout::new(TaskSet::MatrixGame.dims());
