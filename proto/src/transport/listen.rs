@@ -33,8 +33,8 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 /// Refusals that are remembered as logged.
 const LOGGED_MAX: usize = 1000;
 
-/// Bytes of a refused caller that are still read, so that the refusal reaches it.
-const LINGER_BYTES: usize = 64 << 10;
+/// Bytes of a refused caller that are read at once, until it closes, so that the refusal reaches it.
+const LINGER_BYTES: usize = 4 << 10;
 
 /// Why a learner cannot listen.
 #[derive(Debug, thiserror::Error)]
@@ -253,10 +253,12 @@ async fn handshake(
     match greeted.map_err(|_| Refused::Slow(ip))? {
         Ok(stream) => Ok(Connection { io: Io::Tls(Box::new(stream)), _place: place }),
         Err((error, mut stream)) => {
-            // Closed with unread bytes, the connection would be reset, and the caller would not learn why.
+            // Closed with unread bytes, the connection would be reset, and the caller would not learn why: what it
+            // still sends is read until it closes.
             let _ = stream.shutdown().await;
             let mut rest = vec![0; LINGER_BYTES];
-            let _ = tokio::time::timeout(CONNECT_TIMEOUT, stream.read(&mut rest)).await;
+            let drain = async { while stream.read(&mut rest).await.is_ok_and(|read| read > 0) {} };
+            let _ = tokio::time::timeout(CONNECT_TIMEOUT, drain).await;
             Err(Refused::Tls { ip, error })
         }
     }
