@@ -382,6 +382,8 @@ pub enum CtlCommand {
         #[arg(long, value_name = "STEPS", default_value_t = 0)]
         from: u64,
     },
+    /// Print the address of the run's web page; it carries the run's token
+    Web,
     /// End the run: checkpoint, summary, farewell
     Stop,
 }

@@ -16,7 +16,7 @@ use rit_proto::{
 };
 use std::{
     io::{self, Write as _},
-    path::PathBuf,
+    path::{Path, PathBuf},
     process::ExitCode,
 };
 
@@ -59,6 +59,7 @@ pub async fn run(options: CtlOptions) -> Result<ExitCode, Failure> {
             .await?;
             return Ok(ExitCode::SUCCESS);
         }
+        CtlCommand::Web => web(&root, options.json)?,
     };
     print!("{text}");
     Ok(ExitCode::SUCCESS)
@@ -83,6 +84,17 @@ async fn metrics(
         }
     }
     Ok(())
+}
+
+fn web(root: &Path, as_json: bool) -> Result<String, Failure> {
+    if root.as_os_str().is_empty() {
+        let message = "the web page is served to the learner's own machine; ask there, with --run DIR";
+        return Err(Failure::input_message(message));
+    }
+    let (run_dir, _) = RunDir::open(root)?;
+    let off = || Failure::input_message("the run serves no web page: web.listen = \"off\"");
+    let url = run_dir.web_url().ok_or_else(off)?;
+    if as_json { json(&serde_json::json!({ "url": url })) } else { Ok(url + "\n") }
 }
 
 fn json(message: &impl serde::Serialize) -> Result<String, Failure> {

@@ -107,6 +107,7 @@ impl From<LearnerError> for Failure {
             LearnerError::Access(_)
             | LearnerError::Address(_)
             | LearnerError::Listen(_)
+            | LearnerError::Web(_)
             | LearnerError::RunSpace(_)
             | LearnerError::SharedMemory(_)
             | LearnerError::Model(_)

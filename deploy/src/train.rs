@@ -38,7 +38,7 @@ pub async fn run(options: TrainOptions, logs: LogOptions) -> Result<ExitCode, Fa
     let root = run_dir.root().display();
     progress.say(&format!("{name}: learner and {} actors, run directory {root}", config.actors.count));
 
-    let mut run = Run { run_dir: &run_dir, logs: &logs, progress, actors: Vec::new() };
+    let mut run = Run { run_dir: &run_dir, logs: &logs, progress, actors: Vec::new(), web_url: None };
     let ended = run.watch(&config).await;
     run.end_actors().await;
     run.progress.finish();
@@ -101,6 +101,8 @@ struct Run<'a> {
     logs: &'a LogOptions,
     progress: Progress,
     actors: Vec<Process>,
+    /// The web page's address, once it was said.
+    web_url: Option<String>,
 }
 
 impl Run<'_> {
@@ -209,7 +211,7 @@ impl Run<'_> {
     }
 
     /// Waits until the learner listens.
-    async fn control(&self, learner: &mut Process) -> Result<ControlClient<Client>, Failure> {
+    async fn control(&mut self, learner: &mut Process) -> Result<ControlClient<Client>, Failure> {
         let listening = async {
             loop {
                 if let Ok(address) = fs::read_to_string(self.run_dir.address()) {
@@ -231,8 +233,18 @@ impl Run<'_> {
                 )));
             }
         };
+        self.say_web_url();
         let credentials = Credentials::token(self.run_dir.token());
         Ok(ControlClient::new(transport::connect(&address, &credentials).await?))
+    }
+
+    /// Says where the web page is, when it is there first and when it moves.
+    fn say_web_url(&mut self) {
+        let url = self.run_dir.web_url();
+        if let Some(url) = url.as_ref().filter(|_| url != self.web_url) {
+            self.progress.say(&format!("web page: {url}"));
+        }
+        self.web_url = url;
     }
 
     async fn actor_ended(

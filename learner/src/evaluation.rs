@@ -8,7 +8,7 @@ use rit_env::{
 use rit_episode::{Episode, Policy, RunSeed};
 use rit_proto::v1;
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::{collections::BTreeMap, ops::Range};
 
 /// Episodes rolled side by side.
 const SIDE_BY_SIDE: usize = 32;
@@ -115,17 +115,17 @@ impl Evaluator {
         tasks.iter().map(|&task| self.evaluate_task(policy, task, episodes, seed)).collect()
     }
 
-    /// Rolls the first episodes that [`Self::evaluate`] rolls of a task with this seed, and shows their worlds
-    /// to `watch`; see [`Rollout::roll_watched`].
+    /// Rolls those episodes of these numbers that [`Self::evaluate`] rolls of a task with this seed, and shows
+    /// their worlds to `watch`; see [`Rollout::roll_watched`].
     pub fn watch(
         &self,
         policy: &mut dyn Policy,
         task: Task,
-        episodes: usize,
+        numbers: Range<u64>,
         seed: RunSeed,
         watch: impl FnMut(usize, &dyn Environment),
     ) -> Vec<Episode> {
-        self.rollout(task, seed).roll_watched(policy, &jobs(episodes), watch)
+        self.rollout(task, seed).roll_watched(policy, &jobs(numbers), watch)
     }
 
     fn rollout(&self, task: Task, seed: RunSeed) -> Rollout {
@@ -142,7 +142,7 @@ impl Evaluator {
     ) -> TaskResult {
         let mut rollout = self.rollout(task, seed);
         let (mut total, mut won) = (0.0, 0);
-        for jobs in jobs(episodes).chunks(SIDE_BY_SIDE) {
+        for jobs in jobs(0..episodes as u64).chunks(SIDE_BY_SIDE) {
             for episode in rollout.roll(policy, jobs) {
                 total += episode.total_reward();
                 won += usize::from(episode.won);
@@ -159,10 +159,10 @@ impl Evaluator {
     }
 }
 
-/// So many greedy episodes of a rollout's one task.
-fn jobs(episodes: usize) -> Vec<Job> {
+/// Greedy episodes of these numbers of a rollout's one task.
+fn jobs(numbers: Range<u64>) -> Vec<Job> {
     let job = |number| Job { number, weights_version: 0, epsilon: 0.0, task: Some(0) };
-    (0..episodes as u64).map(job).collect()
+    numbers.map(job).collect()
 }
 
 #[cfg(test)]
@@ -204,9 +204,11 @@ mod tests {
         let task = evaluator.tasks(&["predator-prey-3-2".into()]).unwrap()[0];
         let mut states = [0; 4];
         let watched =
-            evaluator.watch(&mut Script::Chase, task, 4, RunSeed(1), |episode, _| states[episode] += 1);
+            evaluator.watch(&mut Script::Chase, task, 0..4, RunSeed(1), |episode, _| states[episode] += 1);
         let measured = evaluator.evaluate(&mut Script::Chase, &[task], 4, RunSeed(1));
         let mean = watched.iter().map(Episode::total_reward).sum::<f64>() / 4.0;
         assert_eq!((mean, states), (measured[0].mean_return, [26; 4]));
+        let last = evaluator.watch(&mut Script::Chase, task, 3..4, RunSeed(1), |_, _| {});
+        assert_eq!(last, watched[3..], "its number makes an episode what it is");
     }
 }

@@ -1,7 +1,9 @@
 //! The learner: receives episodes, updates the weights, and serves whoever asks.
 //!
 //! Four threads and a runtime. [`receive`] reads shared memory; [`trainer`] owns replay and weights; [`writer`]
-//! writes replay and checkpoints; [`update`](rit_algo::Update)'s threads work on batches. On the runtime, [`coordinator`] owns the [`ledger`] and the gRPC services turn calls into its events.
+//! writes replay and checkpoints; [`update`](rit_algo::Update)'s threads work on batches. On the runtime,
+//! [`coordinator`] owns the [`ledger`]; the gRPC services and the [`web`] page turn calls into its events, by a
+//! [`run_handle`].
 
 pub mod checkpoint;
 pub mod control_service;
@@ -17,8 +19,10 @@ pub mod replay;
 pub mod replay_log;
 pub mod rollout_service;
 mod run;
+pub mod run_handle;
 pub mod tensorboard;
 pub mod trainer;
+pub mod web;
 pub mod weights;
 pub mod weights_file;
 pub mod writer;

@@ -271,6 +271,16 @@ impl Follower {
         lines.map(|line| serde_json::from_slice(line).map_err(io::Error::from)).collect()
     }
 
+    /// Where it reads on, in bytes.
+    pub fn at(&self) -> u64 {
+        self.at
+    }
+
+    /// Reads on from here, which is where a line begins.
+    pub fn begin_at(&mut self, at: u64) {
+        self.at = at;
+    }
+
     /// Waits for further lines; `false` when there will be none, since nobody writes any more.
     pub async fn more(&mut self) -> bool {
         self.len.changed().await.is_ok()

@@ -8,7 +8,9 @@ use crate::{
     receive::receive,
     replay_log::{ReplayLog, ReplayLogError},
     rollout_service::RolloutService,
+    run_handle::RunHandle,
     trainer::{Summary, TrainError, Trainer},
+    web::{Web, WebError},
     weights::WeightsService,
     writer::Writer,
 };
@@ -66,6 +68,9 @@ pub enum LearnerError {
     /// It cannot listen.
     #[error(transparent)]
     Listen(#[from] ListenError),
+    /// The web page cannot be served.
+    #[error(transparent)]
+    Web(#[from] WebError),
     /// The run directory is no place for shared memory.
     #[error(transparent)]
     RunSpace(#[from] RunSpaceError),
@@ -110,6 +115,7 @@ pub async fn run(
     shutdown: impl Future<Output = ()>,
 ) -> Result<Summary, LearnerError> {
     let doors = listen(&run_dir, &config).await?;
+    let web = Web::bind(&run_dir, config.web.listen).await?;
     let rit = Arc::new(Rit::new(config.rit())?);
     let expected = expected(&run_dir, &config);
     let space = RunSpace::new(&run_dir.shared_memory_root())?;
@@ -160,9 +166,15 @@ pub async fn run(
         })?
     };
 
+    let handle = RunHandle::new(events.clone(), board.clone(), Arc::new(config), rit);
+    let mut serving_web = JoinSet::new();
+    if let Some(web) = web {
+        tracing::info!(address = %web.address(), "the web page is served");
+        serving_web.spawn(web.serve(handle.clone(), metrics.clone(), run_dir.clone()));
+    }
     let episode_bytes_max = episodes.message_bytes_max();
-    let weights = WeightsServer::new(WeightsService(Arc::clone(&board)));
-    let control = ControlService::new(events.clone(), board, metrics, Arc::new(config), rit);
+    let weights = WeightsServer::new(WeightsService(board));
+    let control = ControlService { run: handle, metrics };
     let rollout = RolloutServer::new(RolloutService(events.clone()));
     let (health_reporter, health) = tonic_health::server::health_reporter();
     health_reporter.set_serving::<WeightsServer<WeightsService>>().await;
@@ -213,6 +225,7 @@ pub async fn run(
         }
     };
     let _ = tokio::time::timeout(CLOSE_TIMEOUT, closing).await;
+    let _ = tokio::time::timeout(CLOSE_TIMEOUT, serving_web.join_next()).await;
     let _ = fs::remove_file(run_dir.address());
     let _ = fs::remove_file(run_dir.remote_address());
     receiving.await.map_err(|_| LearnerError::Panicked("receive"))??;

@@ -6,6 +6,7 @@ use rit_env::{EnvironmentOptions, TaskSet};
 use rit_episode::RunSeed;
 use rit_nn::OptimizerKind;
 use serde::{Deserialize, Serialize};
+use std::net::SocketAddr;
 
 /// Everything a run is made from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -21,6 +22,7 @@ pub struct Config {
     pub checkpoints: Checkpoints,
     pub actors: Actors,
     pub learner: Learner,
+    pub web: Web,
 }
 
 /// `[environment]`.
@@ -191,6 +193,52 @@ pub struct Tls {
     pub certificate: String,
     pub key: String,
     pub client_ca: String,
+}
+
+/// `[web]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs, reason = "presets/all.toml documents every key, for users too")]
+pub struct Web {
+    pub listen: WebListen,
+}
+
+/// Where the learner's web page is served. It speaks plain HTTP, so only this machine gets to it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum WebListen {
+    /// Nowhere.
+    Off,
+    /// On this loopback address; with port 0 the system chooses one.
+    On(SocketAddr),
+}
+
+impl TryFrom<String> for WebListen {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        if text == "off" {
+            return Ok(Self::Off);
+        }
+        match text.parse::<SocketAddr>() {
+            Ok(address) if address.ip().is_loopback() => Ok(Self::On(address)),
+            Ok(address) => Err(format!(
+                "web.listen = {text:?}: the page is served to this machine only; write \"127.0.0.1:{port}\", and \
+                 reach it from another machine with ssh -L {port}:127.0.0.1:{port} THIS-MACHINE",
+                port = address.port()
+            )),
+            Err(_) => Err(format!("web.listen = {text:?}; write \"127.0.0.1:PORT\" or \"off\"")),
+        }
+    }
+}
+
+impl From<WebListen> for String {
+    fn from(listen: WebListen) -> Self {
+        match listen {
+            WebListen::Off => "off".into(),
+            WebListen::On(address) => address.to_string(),
+        }
+    }
 }
 
 impl Config {

@@ -10,7 +10,7 @@ mod run_dir;
 
 pub use config::{
     Actors, Algorithm, Checkpoints, Config, Environment, Evaluation, Learner, MixingKind, Network,
-    OptimizerName, Tls, Training, Until,
+    OptimizerName, Tls, Training, Until, Web, WebListen,
 };
 pub use resolve::{ConfigError, resolve, set};
 pub use run_dir::{RunDir, RunDirError};

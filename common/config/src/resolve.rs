@@ -127,7 +127,7 @@ const FREE: [&str; 10] = [
     "learner.tls",
     "learner.threads",
     "learner.metrics_every_env_steps",
-    "learner.web",
+    "web",
 ];
 
 /// Whether a run of the one configuration may go on as one of the other.
@@ -322,6 +322,9 @@ mod tests {
         );
         assert_eq!(message(&["network.n_heads=3"]), "attention_dim 64 is not a multiple of n_heads 3");
         assert!(message(&["training.until=win_rate=2"]).contains("write win_rate=NUMBER"));
+        assert!(message(&["web.listen=0.0.0.0:8080"]).contains("ssh -L 8080:127.0.0.1:8080 THIS-MACHINE"));
+        assert!(message(&["web.listen=8080"]).contains("must be a word in quotes"));
+        assert!(message(&["web.listen=on"]).ends_with("write \"127.0.0.1:PORT\" or \"off\""));
         assert!(message(&["algorithm.mixing=vdn"]).contains("expected `network` or `sum`"));
         assert!(
             message(&["environment.task_set=chess"])

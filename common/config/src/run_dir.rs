@@ -170,6 +170,16 @@ impl RunDir {
         self.root.join("remote_address")
     }
 
+    /// The file of [`Self::web_url`], for the run's user alone.
+    pub fn web(&self) -> PathBuf {
+        self.root.join("web")
+    }
+
+    /// The web page's address with the token, if a learner of this run serves or served one.
+    pub fn web_url(&self) -> Option<String> {
+        fs::read_to_string(self.web()).ok().map(|url| url.trim().to_owned())
+    }
+
     /// The resolved configuration.
     pub fn config_path(&self) -> PathBuf {
         self.root.join("config.toml")

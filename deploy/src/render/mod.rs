@@ -83,10 +83,10 @@ fn record(options: &RenderOptions) -> Result<Film, Failure> {
     let seed = player.seed(options.seed);
     let count = usize::from(options.episodes);
     let mut scenes = vec![Vec::new(); count];
-    let episodes =
-        Evaluator::new(&player.config).watch(player.policy.as_mut(), task, count, seed, |episode, world| {
-            scenes[episode].extend(world.scene());
-        });
+    let (evaluator, numbers) = (Evaluator::new(&player.config), 0..count as u64);
+    let episodes = evaluator.watch(player.policy.as_mut(), task, numbers, seed, |episode, world| {
+        scenes[episode].extend(world.scene());
+    });
     if scenes.iter().any(Vec::is_empty) {
         return Err(Failure::input_message(format!(
             "{task} is played on a table of rewards, where nothing has a place: there is nothing to draw; \

@@ -19,7 +19,7 @@ mod serve;
 #[cfg(test)]
 mod tests;
 
-pub use access::{Access, AccessError, AccessFiles};
+pub use access::{Access, AccessError, AccessFiles, is_secret};
 pub use address::{Address, AddressError};
 pub use connect::{Client, ConnectError, CredentialFiles, Credentials, CredentialsError, connect};
 pub use files::{FileError, check_private};

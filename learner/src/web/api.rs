@@ -1,0 +1,281 @@
+//! What the page asks. Reading is GET, changing is POST; answers and errors are JSON.
+
+use super::{Page, events};
+use crate::{
+    coordinator::Control,
+    prometheus,
+    run_handle::{AskError, Watched},
+};
+use axum::{
+    Json, Router,
+    extract::{Query, State, rejection::JsonRejection},
+    http::{StatusCode, header},
+    response::{IntoResponse, Response},
+    routing::{get, post},
+};
+use rit_env::{BodyKind, Scene, Split, Task};
+use rit_episode::Action;
+use rit_proto::v1;
+use serde::{Deserialize, Serialize};
+use std::{
+    fs::{self, File},
+    io::{self, Read as _, Seek as _, SeekFrom},
+    path::Path,
+};
+
+/// Bytes of the end of a log that are shown.
+const LOG_BYTES: u64 = 32 << 10;
+
+/// Most episodes of each task that one evaluation rolls.
+const EPISODES_MAX: u32 = 10_000;
+
+pub fn router() -> Router<Page> {
+    Router::new()
+        .route("/api/run", get(run))
+        .route("/api/events", get(events::events))
+        .route("/api/log", get(log))
+        .route("/metrics", get(prometheus))
+        .route("/api/pause", post(async |State(page)| tell(page, Control::Pause).await))
+        .route("/api/resume", post(async |State(page)| tell(page, Control::Resume).await))
+        .route("/api/stop", post(async |State(page)| tell(page, Control::Stop).await))
+        .route("/api/checkpoint", post(checkpoint))
+        .route("/api/evaluate", post(evaluate))
+        .route("/api/watch", post(watch))
+}
+
+/// Why there is no answer.
+#[derive(Debug, thiserror::Error)]
+pub enum ApiError {
+    #[error(
+        "the request does not carry this run's token; `rit ctl --run DIR web` prints the address that does"
+    )]
+    Unauthorized,
+    #[error("{0}")]
+    Forbidden(&'static str),
+    #[error("there is nothing here")]
+    NotFound,
+    #[error("the answer takes too long")]
+    TooSlow,
+    #[error("{}", .0.body_text())]
+    Body(#[from] JsonRejection),
+    #[error("{0} episodes are too many: at most {EPISODES_MAX}")]
+    Episodes(u32),
+    #[error(transparent)]
+    Ask(#[from] AskError),
+    #[error("{0}")]
+    Io(#[from] io::Error),
+}
+
+impl IntoResponse for ApiError {
+    fn into_response(self) -> Response {
+        let status = match &self {
+            Self::Unauthorized => StatusCode::UNAUTHORIZED,
+            Self::Forbidden(_) => StatusCode::FORBIDDEN,
+            Self::NotFound => StatusCode::NOT_FOUND,
+            Self::TooSlow => StatusCode::GATEWAY_TIMEOUT,
+            Self::Body(rejection) => rejection.status(),
+            Self::Episodes(_) | Self::Ask(AskError::Task(_) | AskError::NoTasks(_)) => {
+                StatusCode::BAD_REQUEST
+            }
+            Self::Ask(AskError::Over) => StatusCode::SERVICE_UNAVAILABLE,
+            Self::Ask(AskError::Checkpoint(_) | AskError::Rollout(_)) | Self::Io(_) => {
+                StatusCode::INTERNAL_SERVER_ERROR
+            }
+        };
+        (status, Json(serde_json::json!({ "error": self.to_string() }))).into_response()
+    }
+}
+
+/// What stays the same as long as a run goes.
+#[derive(Serialize)]
+struct Run {
+    name: String,
+    directory: String,
+    version: &'static str,
+    task_set: String,
+    training_tasks: Vec<String>,
+    testing_tasks: Vec<String>,
+    has_wins: bool,
+    /// Whether episodes can be drawn.
+    has_scenes: bool,
+    evaluation_episodes: usize,
+    config: String,
+}
+
+async fn run(State(page): State<Page>) -> Result<Json<Run>, ApiError> {
+    let (config, root) = (page.handle.config(), page.run_dir.root());
+    let task_set = config.environment.task_set;
+    let names = |split| task_set.tasks(split).iter().map(Task::to_string).collect();
+    let scene = |task: &Task| task.environment(config.environment_options()).scene();
+    Ok(Json(Run {
+        name: root.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+        directory: root.display().to_string(),
+        version: env!("CARGO_PKG_VERSION"),
+        task_set: task_set.to_string(),
+        training_tasks: names(Split::Training),
+        testing_tasks: names(Split::Testing),
+        has_wins: task_set.has_wins(),
+        has_scenes: task_set.tasks(Split::Training).iter().all(|task| scene(task).is_some()),
+        evaluation_episodes: config.evaluation.episodes,
+        config: fs::read_to_string(page.run_dir.config_path())?,
+    }))
+}
+
+/// How the run stands, for Prometheus, which gives the token as a bearer.
+async fn prometheus(State(page): State<Page>) -> Result<Response, ApiError> {
+    let text = prometheus::render(page.handle.ask(Control::Status).await?).map_err(io::Error::other)?;
+    Ok(([(header::CONTENT_TYPE, prometheus::CONTENT_TYPE)], text).into_response())
+}
+
+async fn tell(
+    page: Page,
+    what: impl FnOnce(tokio::sync::oneshot::Sender<v1::RunStatus>) -> Control,
+) -> Result<Json<v1::RunStatus>, ApiError> {
+    Ok(Json(page.handle.ask(what).await?))
+}
+
+async fn checkpoint(State(page): State<Page>) -> Result<Json<v1::CheckpointResponse>, ApiError> {
+    Ok(Json(page.handle.checkpoint().await?))
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Evaluate {
+    /// `training`, `testing` or names of tasks.
+    tasks: Vec<String>,
+    /// Of each task; 0 means the run's own number.
+    #[serde(default)]
+    episodes: u32,
+}
+
+async fn evaluate(
+    State(page): State<Page>,
+    body: Result<Json<Evaluate>, JsonRejection>,
+) -> Result<Json<v1::Evaluation>, ApiError> {
+    let Json(Evaluate { tasks, episodes }) = body?;
+    if episodes > EPISODES_MAX {
+        return Err(ApiError::Episodes(episodes));
+    }
+    Ok(Json(page.handle.evaluate(v1::EvaluateRequest { tasks, episodes, seed: None }).await?))
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Watch {
+    task: String,
+    /// Which of the episodes that evaluations of the task roll.
+    number: u32,
+}
+
+/// One greedy episode, agents in the environment's own order: with n agents and T steps.
+#[derive(Serialize)]
+struct Shown {
+    task: String,
+    number: u32,
+    weights_version: u64,
+    env_steps: u64,
+    /// `[n]`, the agent that decides first, second, …
+    decision_order: Vec<u8>,
+    /// `[T][n]`, by agent.
+    actions: Vec<Vec<Action>>,
+    /// `[T]`.
+    rewards: Vec<f32>,
+    /// `None` where the task knows no winning.
+    won: Option<bool>,
+    /// `[T + 1][m]`, agents first; empty where entities have no places.
+    scenes: Vec<Vec<ShownBody>>,
+}
+
+#[derive(Serialize)]
+struct ShownBody {
+    kind: &'static str,
+    x: f32,
+    y: f32,
+    radius: f32,
+}
+
+async fn watch(
+    State(page): State<Page>,
+    body: Result<Json<Watch>, JsonRejection>,
+) -> Result<Json<Shown>, ApiError> {
+    let Json(Watch { task, number }) = body?;
+    let Watched { snapshot, episode, scenes } = page.handle.watch(&task, number.into()).await?;
+    let by_agent = |row_actions: &[Action]| {
+        let mut actions = vec![0; episode.n_agents];
+        for (&agent, &action) in episode.decision_order.iter().zip(row_actions) {
+            actions[usize::from(agent)] = action;
+        }
+        actions
+    };
+    let has_wins = page.handle.config().environment.task_set.has_wins();
+    Ok(Json(Shown {
+        task,
+        number,
+        weights_version: snapshot.version,
+        env_steps: snapshot.env_steps,
+        actions: episode.actions.chunks_exact(episode.n_agents).map(by_agent).collect(),
+        won: has_wins.then_some(episode.won),
+        scenes: scenes.iter().map(shown).collect(),
+        decision_order: episode.decision_order,
+        rewards: episode.rewards,
+    }))
+}
+
+fn shown(scene: &Scene) -> Vec<ShownBody> {
+    let bodies = scene.bodies.iter().map(|body| ShownBody {
+        kind: match body.kind {
+            BodyKind::Agent => "agent",
+            BodyKind::Landmark => "landmark",
+            BodyKind::Prey => "prey",
+        },
+        x: body.x,
+        y: body.y,
+        radius: body.radius,
+    });
+    bodies.collect()
+}
+
+#[derive(Deserialize)]
+struct Log {
+    process: String,
+}
+
+/// The end of one process's log, and which processes have one.
+#[derive(Serialize)]
+struct LogTail {
+    processes: Vec<String>,
+    text: String,
+}
+
+async fn log(
+    State(page): State<Page>,
+    Query(Log { process }): Query<Log>,
+) -> Result<Json<LogTail>, ApiError> {
+    let logs = page.run_dir.logs();
+    let mut processes = Vec::new();
+    for entry in fs::read_dir(&logs)? {
+        let name = entry?.file_name().to_string_lossy().into_owned();
+        processes.extend(name.strip_suffix(".log").map(str::to_owned));
+    }
+    processes.sort_by_key(|name| (name != "learner", name.len(), name.clone()));
+    // Only what lies there is read, whatever was asked for.
+    let text = match processes.contains(&process) {
+        true => tail(&logs.join(format!("{process}.log")))?,
+        false => return Err(ApiError::NotFound),
+    };
+    Ok(Json(LogTail { processes, text }))
+}
+
+/// The last whole lines of a file.
+fn tail(path: &Path) -> io::Result<String> {
+    let mut file = File::open(path)?;
+    let skipped = file.metadata()?.len().saturating_sub(LOG_BYTES);
+    file.seek(SeekFrom::Start(skipped))?;
+    let mut bytes = Vec::new();
+    file.take(LOG_BYTES).read_to_end(&mut bytes)?;
+    let text = String::from_utf8_lossy(&bytes);
+    Ok(match text.split_once('\n') {
+        Some((_, whole)) if skipped > 0 => whole.to_owned(),
+        _ => text.into_owned(),
+    })
+}

@@ -1,0 +1,202 @@
+// The page: what the learner sends goes into panels and charts, buttons go back to it.
+
+import { Chart } from "./chart.js";
+import { EpisodeView } from "./episode.js";
+import { get, listen, post } from "./feed.js";
+import { followLog, showLedger, showProcesses, showTiles } from "./panels.js";
+import { byId, duration, grouped, make, short } from "./text.js";
+
+/** Small charts: key in a training line, and what it is called. */
+const SMALL = [
+  ["td_loss", "TD loss"],
+  ["contrastive_loss", "Contrastive loss"],
+  ["grad_norm", "Gradient norm"],
+  ["epsilon", "Exploration ε"],
+];
+
+const NOTE_MS = 8000;
+
+const run = await get("/api/run");
+const episode = new EpisodeView(run, (text) => note(text, "bad"));
+/** Lines of metrics.jsonl by kind. */
+const lines = { training: [], evaluation: [] };
+let link = "lost";
+let status = null;
+
+const curve = new Chart(byId("curve"), { label: "Learning curves" });
+const small = SMALL.map(([key, name]) => {
+  const box = make("div", { class: "chart" });
+  byId("small-charts").append(make("section", { class: "card" }, make("h2", {}, name), box));
+  return { key, name, chart: new Chart(box, { label: name, compact: true, range: key === "epsilon" ? [0, 1] : null }) };
+});
+
+function note(text, look = "") {
+  const element = make("p", { class: look }, text);
+  byId("notes").append(element);
+  setTimeout(() => element.remove(), NOTE_MS);
+}
+
+const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).value;
+
+function drawCurves() {
+  const [kind, measure] = [chosen("kind"), chosen("measure")];
+  const names = run.training_tasks;
+  const series = names.map((name, colour) => ({
+    name,
+    colour,
+    points: lines[kind].filter(({ tasks }) => tasks[name]).map(({ env_steps, tasks }) => [env_steps, tasks[name][measure]]),
+  }));
+  curve.range = measure === "win_rate" ? [0, 1] : null;
+  curve.show(series, kind === "evaluation" ? "The first evaluation is still to come" : "The first point is still to come");
+  byId("curve-legend").replaceChildren(
+    ...series.map(({ name, colour, points }) =>
+      make("li", {}, make("i", { class: `swatch c${colour}` }), name, make("b", {}, points.length ? short(points.at(-1)[1]) : "–")),
+    ),
+  );
+}
+
+function drawSmall() {
+  for (const { key, name, chart } of small) {
+    chart.show([{ name, colour: 0, points: lines.training.map((line) => [line.env_steps, line[key]]) }], "–");
+  }
+}
+
+function redraw() {
+  drawCurves();
+  drawSmall();
+}
+
+function showStatus() {
+  const state = link === "live" ? status.state : { lost: "no answer", over: "ended" }[link];
+  const look = { running: "good", paused: "warn", stopping: "warn", "no answer": "bad" }[state] ?? "";
+  byId("state").textContent = state;
+  byId("state").className = `pill ${look}`;
+  document.title = `${state} · ${run.name} · RIT`;
+  const live = link === "live" && state !== "stopping";
+  byId("pause").textContent = state === "paused" ? "Resume" : "Pause";
+  for (const id of ["pause", "evaluate", "checkpoint", "stop"]) byId(id).disabled = !live;
+  episode.enabled = live;
+  document.body.classList.toggle("stale", link !== "live");
+  if (!status) return;
+  const speed = state === "running" ? status.rates : null;
+  const share = Math.min(1, status.env_steps / status.env_steps_max);
+  byId("progress").value = share;
+  byId("progress-steps").textContent =
+    `${grouped(status.env_steps)} of ${grouped(status.env_steps_max)} steps, ${Math.floor(share * 100)} %`;
+  const left = (status.env_steps_max - status.env_steps) / speed?.env_steps_per_s;
+  byId("progress-left").textContent = speed?.env_steps_per_s > 0.5 ? `${duration(left)} left` : "";
+  showTiles(status, speed);
+  showProcesses(status);
+  showLedger(status.ledger);
+}
+
+/** Does what a button wants; what goes wrong is said. */
+const onClick = (id, work) =>
+  byId(id).addEventListener("click", async () => {
+    try {
+      await work();
+    } catch (error) {
+      note(error.message, "bad");
+    }
+  });
+
+const change = async (what) => {
+  status = await post(`/api/${what}`);
+  showStatus();
+};
+
+function setUpButtons() {
+  onClick("pause", () => change(status.state === "paused" ? "resume" : "pause"));
+  onClick("checkpoint", async () => {
+    const { path, env_steps } = await post("/api/checkpoint");
+    note(`Checkpoint at ${grouped(env_steps)} steps: ${path}`);
+  });
+  onClick("stop", () => byId("stop-dialog").showModal());
+  onClick("stop-cancel", () => byId("stop-dialog").close());
+  onClick("stop-confirm", async () => {
+    byId("stop-dialog").close();
+    await change("stop");
+  });
+}
+
+function setUpEvaluate() {
+  const option = (value, text = value) => make("option", { value }, text);
+  byId("evaluate-tasks").append(
+    option("training", "all training tasks"),
+    ...(run.testing_tasks.length ? [option("testing", "all testing tasks")] : []),
+    ...[...run.training_tasks, ...run.testing_tasks].map((name) => option(name)),
+  );
+  byId("evaluate-episodes").value = run.evaluation_episodes;
+  onClick("evaluate", () => byId("evaluate-dialog").showModal());
+  onClick("evaluate-close", () => byId("evaluate-dialog").close());
+  onClick("evaluate-go", async () => {
+    const go = byId("evaluate-go");
+    go.disabled = true;
+    byId("evaluate-result").textContent = "Rolling…";
+    try {
+      const tasks = [byId("evaluate-tasks").value];
+      showEvaluation(await post("/api/evaluate", { tasks, episodes: Number(byId("evaluate-episodes").value) }));
+    } catch (error) {
+      byId("evaluate-result").textContent = error.message;
+    }
+    go.disabled = false;
+  });
+}
+
+function showEvaluation({ env_steps, weights_version, tasks }) {
+  const number = (text) => make("td", { class: "n" }, text);
+  const head = ["Task", "Episodes", "Mean return", ...(run.has_wins ? ["Win rate"] : [])];
+  const rows = tasks.map(({ task, episodes, mean_return, win_rate }) =>
+    make("tr", {}, make("th", {}, task), number(grouped(episodes)), number(short(mean_return)), ...(run.has_wins ? [number(win_rate.toFixed(3))] : [])),
+  );
+  const heads = head.map((text, at) => make("th", at ? { class: "n" } : {}, text));
+  byId("evaluate-result").replaceChildren(
+    make("p", { class: "note" }, `Weights ${grouped(weights_version)} at ${grouped(env_steps)} steps`),
+    make("table", {}, make("thead", {}, make("tr", {}, ...heads)), make("tbody", {}, ...rows)),
+  );
+}
+
+function setUpCurves() {
+  for (const [name, standard] of [["kind", "training"], ["measure", "mean_return"]]) {
+    const stored = localStorage.getItem(name);
+    const radios = [...document.querySelectorAll(`input[name=${name}]`)];
+    const first = radios.find(({ value }) => value === stored) ?? radios.find(({ value }) => value === standard);
+    first.checked = true;
+    for (const radio of radios) {
+      radio.addEventListener("change", () => {
+        localStorage.setItem(name, radio.value);
+        drawCurves();
+      });
+    }
+  }
+  if (run.has_wins) byId("curve-measure").hidden = false;
+  else document.querySelector("input[value=mean_return]").checked = true;
+}
+
+byId("run-name").textContent = run.name;
+byId("run-where").textContent = run.task_set;
+byId("run-where").title = run.directory;
+byId("config").textContent = run.config;
+setUpButtons();
+setUpEvaluate();
+setUpCurves();
+redraw();
+followLog();
+listen({
+  reset() {
+    lines.training = [];
+    lines.evaluation = [];
+  },
+  metrics(news) {
+    for (const line of news) lines[line.kind]?.push(line);
+    redraw();
+  },
+  status(news) {
+    status = news;
+    showStatus();
+  },
+  link(state) {
+    link = state;
+    if (state !== "live") showStatus();
+  },
+});
