@@ -27,13 +27,13 @@ pub struct ControlService {
 }
 
 /// One reader's stream of metrics: lines from disk at its own pace, statuses where there is room.
-struct MetricsStream {
+struct MetricsReader {
     service: ControlService,
     from_env_steps: u64,
     to: mpsc::Sender<Result<v1::MetricsUpdate, Status>>,
 }
 
-impl MetricsStream {
+impl MetricsReader {
     /// Until the run is over, or the reader has gone: then `None`.
     async fn run(mut self, follow: bool, status_every: Option<Duration>) -> Option<()> {
         self.send_lines().await?;
@@ -122,8 +122,8 @@ impl control_server::Control for ControlService {
         let status_every = (status_every_ms > 0)
             .then(|| Duration::from_millis(status_every_ms.into()).max(STATUS_EVERY_MIN));
         let (to, updates) = mpsc::channel(METRICS_QUEUE);
-        let stream = MetricsStream { service: self.clone(), from_env_steps, to };
-        tokio::spawn(stream.run(follow, status_every));
+        let reader = MetricsReader { service: self.clone(), from_env_steps, to };
+        tokio::spawn(reader.run(follow, status_every));
         Ok(Response::new(Box::pin(ReceiverStream::new(updates))))
     }
 
