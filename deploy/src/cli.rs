@@ -384,6 +384,18 @@ pub enum CtlCommand {
     },
     /// Print the address of the run's web page; it carries the run's token
     Web,
+    /// Change settings while the run goes on: algorithm.epsilon_finish, evaluation.every_env_steps, evaluation.episodes,
+    /// checkpoints.every_env_steps, actors.count, actors.heartbeat_timeout_ms, learner.metrics_every_env_steps, and what
+    /// the learner logs, such as log=debug
+    Set {
+        /// What to set
+        #[arg(required = true, value_name = "KEY=VALUE")]
+        settings: Vec<String>,
+    },
     /// End the run: checkpoint, summary, farewell
-    Stop,
+    Stop {
+        /// Let the episodes under way arrive first, and train on every batch they complete
+        #[arg(long)]
+        drain: bool,
+    },
 }

@@ -11,7 +11,8 @@ use rit_proto::{
     transport::{self, Client},
     v1::{
         CheckpointRequest, EvaluateRequest, Evaluation, MetricsRequest, PauseRequest, ResumeRequest,
-        RunStatus, StatusRequest, StopRequest, control_client::ControlClient, metrics_update::Update,
+        RunStatus, SetRequest, StatusRequest, StopRequest, control_client::ControlClient,
+        metrics_update::Update,
     },
 };
 use std::{
@@ -39,7 +40,12 @@ pub async fn run(options: CtlOptions) -> Result<ExitCode, Failure> {
         CtlCommand::Status => status(&control.status(StatusRequest {}).await?.into_inner(), options.json)?,
         CtlCommand::Pause => status(&control.pause(PauseRequest {}).await?.into_inner(), options.json)?,
         CtlCommand::Resume => status(&control.resume(ResumeRequest {}).await?.into_inner(), options.json)?,
-        CtlCommand::Stop => status(&control.stop(StopRequest {}).await?.into_inner(), options.json)?,
+        CtlCommand::Stop { drain } => {
+            status(&control.stop(StopRequest { drain }).await?.into_inner(), options.json)?
+        }
+        CtlCommand::Set { settings } => {
+            status(&control.set(set_request(&settings)?).await?.into_inner(), options.json)?
+        }
         CtlCommand::Evaluate { tasks, episodes, seed } => {
             let request = EvaluateRequest { tasks, episodes: episodes.unwrap_or(0), seed };
             evaluation(&control.evaluate(request).await?.into_inner(), options.json)?
@@ -63,6 +69,23 @@ pub async fn run(options: CtlOptions) -> Result<ExitCode, Failure> {
     };
     print!("{text}");
     Ok(ExitCode::SUCCESS)
+}
+
+/// What is to be set; `log` is no key of the configuration.
+fn set_request(settings: &[String]) -> Result<SetRequest, Failure> {
+    let mut request = SetRequest::default();
+    for setting in settings {
+        match setting.split_once('=') {
+            Some(("log", filter)) => filter.clone_into(&mut request.log),
+            Some((key, value)) => {
+                request.settings.insert(key.trim().to_owned(), value.trim().to_owned());
+            }
+            None => {
+                return Err(Failure::input_message(format!("{setting:?} is no setting; write KEY=VALUE")));
+            }
+        }
+    }
+    Ok(request)
 }
 
 /// Prints metrics as they come. Whoever reads them may stop reading.

@@ -2,8 +2,12 @@
 
 use crate::failure::Failure;
 use clap::{Args, ValueEnum};
-use std::io::{self, IsTerminal as _};
-use tracing_subscriber::{EnvFilter, fmt};
+use rit_learner::run_handle::SetLog;
+use std::{
+    io::{self, IsTerminal as _},
+    sync::Arc,
+};
+use tracing_subscriber::{EnvFilter, fmt, reload};
 
 /// What the command line says of logs.
 #[derive(Args, Clone, Debug)]
@@ -35,20 +39,38 @@ impl LogOptions {
         ["--log".into(), self.log.clone(), "--log-format".into(), format.into()]
     }
 
-    /// Begins to log to standard error. The span returned names the process in every line.
+    /// Begins to log to standard error. The span returned names the process in every line; the function changes what
+    /// is logged.
     ///
     /// # Errors
     /// When the filter means nothing.
-    pub fn start(&self, process: &str) -> Result<tracing::Span, Failure> {
+    pub fn start(&self, process: &str) -> Result<(tracing::Span, SetLog), Failure> {
         let filter = EnvFilter::try_new(&self.log);
         let filter =
             filter.map_err(|error| Failure::input_message(format!("--log {}: {error}", self.log)))?;
         let builder =
             fmt().with_env_filter(filter).with_writer(io::stderr).with_ansi(io::stderr().is_terminal());
-        match self.log_format {
-            LogFormat::Human => builder.with_target(false).init(),
-            LogFormat::Json => builder.json().with_current_span(true).init(),
-        }
-        Ok(tracing::info_span!("process", name = process, pid = std::process::id()))
+        let set_log = match self.log_format {
+            LogFormat::Human => {
+                let builder = builder.with_target(false).with_filter_reloading();
+                let set_log = set_log(builder.reload_handle());
+                builder.init();
+                set_log
+            }
+            LogFormat::Json => {
+                let builder = builder.json().with_current_span(true).with_filter_reloading();
+                let set_log = set_log(builder.reload_handle());
+                builder.init();
+                set_log
+            }
+        };
+        Ok((tracing::info_span!("process", name = process, pid = std::process::id()), set_log))
     }
+}
+
+fn set_log<S: 'static>(handle: reload::Handle<EnvFilter, S>) -> SetLog {
+    Arc::new(move |filter| {
+        let filter = EnvFilter::try_new(filter).map_err(|error| error.to_string())?;
+        handle.reload(filter).map_err(|error| error.to_string())
+    })
 }

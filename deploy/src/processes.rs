@@ -14,14 +14,14 @@ use tracing::Instrument as _;
 
 /// `rit learner`.
 pub async fn learner(options: LearnerOptions, logs: LogOptions) -> Result<ExitCode, Failure> {
-    let span = logs.start("learner")?;
+    let (span, set_log) = logs.start("learner")?;
     if let Some(experiment) = &options.new {
         let experiment = experiments::load(experiment, &options.settings)?;
         RunDir::create(&options.run_dir, &experiment.config)?;
     }
     let (run_dir, config) = RunDir::open(&options.run_dir)?;
     let shutdown = shutdown::requested(options.supervised);
-    let summary = rit_learner::run(run_dir, config, shutdown).instrument(span).await?;
+    let summary = rit_learner::run(run_dir, config, set_log, shutdown).instrument(span).await?;
     tracing::info!(
         digest = summary.weights_digest,
         env_steps = summary.progress.env_steps,
@@ -32,7 +32,7 @@ pub async fn learner(options: LearnerOptions, logs: LogOptions) -> Result<ExitCo
 
 /// `rit actor`.
 pub async fn actor(options: ActorOptions, logs: LogOptions) -> Result<ExitCode, Failure> {
-    let span = logs.start(&options.name)?;
+    let (span, _) = logs.start(&options.name)?;
     let learner = match (options.address, options.run_dir) {
         (Some(address), _) => Learner::At(address, options.credentials.read()?),
         (None, Some(run_dir)) => Learner::Here(RunDir::open(&run_dir)?.0),

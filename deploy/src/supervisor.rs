@@ -61,6 +61,16 @@ impl Process {
         self.child.id()
     }
 
+    /// Asks it to end in order; [`Process::wait`] sees its end.
+    pub fn ask_to_end(&mut self) {
+        self.lifeline = None;
+    }
+
+    /// Whether it was asked to end.
+    pub fn is_ending(&self) -> bool {
+        self.lifeline.is_none()
+    }
+
     /// Kills it; [`Process::wait`] sees its end.
     pub fn start_kill(&mut self) {
         // Dead already is as good.

@@ -136,13 +136,16 @@ impl Run<'_> {
                     // A learner that is ending or has just died does not answer; its end is seen above.
                     if let Ok(status) = ask(&mut control).await {
                         self.kill_hung_actors(&status);
+                        if !stopping {
+                            self.adjust_actors(status.actors_wanted as usize)?;
+                        }
                         self.progress.update(&status);
                     }
                 }
                 () = &mut interrupted, if !stopping => {
                     stopping = true;
                     self.progress.say("interrupted: ending the run in order");
-                    let _ = control.stop(StopRequest {}).await;
+                    let _ = control.stop(StopRequest::default()).await;
                 }
             }
         }
@@ -153,6 +156,20 @@ impl Run<'_> {
             let name = format!("actor-{index}");
             let actor = self.start(&name, &["actor", "--name", &name])?;
             self.actors.push(actor);
+        }
+        Ok(())
+    }
+
+    /// Starts actors or lets some go, as `rit ctl set actors.count` wants it.
+    fn adjust_actors(&mut self, wanted: usize) -> Result<(), Failure> {
+        let before = self.actors.len();
+        self.start_actors(wanted)?;
+        if self.actors.len() > before {
+            self.progress.say(&format!("{wanted} actors are wanted: started {}", wanted - before));
+        }
+        for actor in self.actors.iter_mut().skip(wanted).filter(|actor| !actor.is_ending()) {
+            self.progress.say(&format!("{wanted} actors are wanted: {} leaves", actor.name()));
+            actor.ask_to_end();
         }
         Ok(())
     }
@@ -254,8 +271,8 @@ impl Run<'_> {
         learner: &mut Process,
         stopping: bool,
     ) -> Result<(), Failure> {
-        if stopping || status.success() {
-            // The learner has said farewell: the run is ending.
+        if stopping || status.success() || self.actors[index].is_ending() {
+            // The learner has said farewell: the run is ending, or fewer actors are wanted.
             self.actors.remove(index);
             return Ok(());
         }

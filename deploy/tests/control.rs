@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{RunFolder, output};
+use common::{RunFolder, Train, output};
 use serde_json::Value;
 
 fn json(output: &std::process::Output) -> Value {
@@ -69,4 +69,62 @@ fn people_get_tables() {
     assert!(String::from_utf8_lossy(&status.stderr).contains("unknown task \"chess\"; known: game-1"));
     let none = train.ctl(&["evaluate", "--tasks", "testing"]);
     assert_eq!(none.status.code(), Some(2));
+}
+
+#[test]
+fn settings_change_while_the_run_goes_on() {
+    let folder = RunFolder::new();
+    let mut train = folder.start(&["matrix-game", "--actors", "1", "--seed", "1"]);
+    let actors = |status: &Value| status["actors"].as_array().unwrap().len();
+    train.wait_for("training", |status| status["updates"].as_u64() > Some(10));
+
+    let status = json(&train.ctl(&["set", "actors.count=3", "log=debug"]));
+    assert_eq!(status["actors_wanted"], 3);
+    train.wait_for("three actors", |status| actors(status) == 3);
+    train.ctl(&["set", "actors.count=1"]);
+    train.wait_for("one actor", |status| actors(status) == 1);
+
+    train.ctl(&["set", "algorithm.epsilon_finish=0.25"]);
+    train.wait_for("epsilon on its way to the new floor", |status| {
+        let (env_steps, epsilon) = (status["env_steps"].as_f64().unwrap(), status["epsilon"].as_f64().unwrap());
+        // To 0.05 it would be 0.008 lower at least.
+        env_steps > 2000.0 && (epsilon - (1.0 - 0.75 * env_steps / 50_000.0)).abs() < 0.003
+    });
+    let (_, config) = rit_config::RunDir::open(&folder.run_dir()).unwrap();
+    assert_eq!((config.algorithm.epsilon_finish, config.actors.count), (0.25, 1), "it is written down");
+    let log = std::fs::read_to_string(folder.run_dir().join("logs/learner.log")).unwrap();
+    assert!(log.contains("DEBUG"), "the learner logs more");
+
+    for (setting, words) in [
+        ("algorithm.gamma=0.5", "algorithm.gamma cannot change while the learner runs"),
+        ("actors.count=17", "actors.count = 17 is out of range 0..=16"),
+        ("algorithm.epsilon_finish=2", "algorithm.epsilon_finish = 2 is out of range 0..=1"),
+        ("actors.cuont=2", "did you mean \"actors.count\"?"),
+        ("nonsense", "write KEY=VALUE"),
+    ] {
+        let refused = train.ctl(&["set", setting]);
+        let stderr = String::from_utf8_lossy(&refused.stderr);
+        assert_eq!(refused.status.code(), Some(2), "{setting}: {stderr}");
+        assert!(stderr.contains(words), "{stderr}");
+    }
+    json(&train.ctl(&["stop"]));
+    train.finish();
+}
+
+#[test]
+fn a_drained_run_has_nothing_under_way_and_goes_on_to_the_same_weights() {
+    let steps = ["matrix-game", "--seed", "3", "--steps", "3000"];
+    let undisturbed = RunFolder::new().train(&[&steps[..], &["--actors", "1"]].concat());
+
+    let folder = RunFolder::new();
+    let mut train = folder.start(&[&steps[..], &["--actors", "2"]].concat());
+    train.wait_for("training", |status| status["updates"].as_u64() > Some(100));
+    assert_eq!(json(&train.ctl(&["stop", "--drain"]))["state"], "stopping");
+    let halfway = train.finish();
+    assert!(halfway["env_steps"].as_u64() < Some(3000));
+    let log = std::fs::read_to_string(folder.run_dir().join("logs/learner.log")).unwrap();
+    assert!(log.contains("rejected: {}"), "no episode was taken back: {log}");
+
+    let whole = Train::resume(&folder, &[]).finish();
+    assert_eq!(whole["weights_digest"], undisturbed["weights_digest"]);
 }

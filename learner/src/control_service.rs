@@ -18,7 +18,7 @@ const METRICS_QUEUE: usize = 16;
 const STATUS_EVERY_MIN: Duration = Duration::from_millis(50);
 
 /// `rit.v1.Control`.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 pub struct ControlService {
     /// The run it speaks for.
     pub run: RunHandle,
@@ -108,8 +108,13 @@ impl control_server::Control for ControlService {
         Ok(Response::new(self.run.ask(Control::Resume).await?))
     }
 
-    async fn stop(&self, _: Request<v1::StopRequest>) -> Result<Response<v1::RunStatus>, Status> {
-        Ok(Response::new(self.run.ask(Control::Stop).await?))
+    async fn stop(&self, request: Request<v1::StopRequest>) -> Result<Response<v1::RunStatus>, Status> {
+        let drain = request.into_inner().drain;
+        Ok(Response::new(self.run.ask(|answer| Control::Stop { drain, answer }).await?))
+    }
+
+    async fn set(&self, request: Request<v1::SetRequest>) -> Result<Response<v1::RunStatus>, Status> {
+        Ok(Response::new(self.run.set(request.into_inner()).await?))
     }
 
     type MetricsStream = Pin<Box<dyn Stream<Item = Result<v1::MetricsUpdate, Status>> + Send>>;
@@ -147,8 +152,10 @@ impl From<AskError> for Status {
         let message = error.to_string();
         match error {
             AskError::Over => Self::unavailable(message),
-            AskError::Task(_) | AskError::NoTasks(_) => Self::invalid_argument(message),
-            AskError::Checkpoint(_) | AskError::Rollout(_) => Self::internal(message),
+            AskError::Task(_) | AskError::NoTasks(_) | AskError::Setting(_) | AskError::Log(_) => {
+                Self::invalid_argument(message)
+            }
+            AskError::Checkpoint(_) | AskError::Rollout(_) | AskError::RunDir(_) => Self::internal(message),
         }
     }
 }

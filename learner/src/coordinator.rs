@@ -18,7 +18,7 @@ use rit_episode::{Episode, wire};
 use rit_proto::v1::{self, LearnerMessage, learner_message::Message};
 use std::{
     collections::BTreeMap,
-    sync::mpsc,
+    sync::{Arc, mpsc},
     time::{Duration, Instant},
 };
 use tokio::sync::{mpsc as async_mpsc, oneshot};
@@ -77,8 +77,15 @@ pub enum Control {
     Resume(oneshot::Sender<v1::RunStatus>),
     /// A checkpoint.
     Checkpoint(oneshot::Sender<Checkpointed>),
-    /// The end of the run.
-    Stop(oneshot::Sender<v1::RunStatus>),
+    /// The end of the run, with what is under way (`drain`) or without.
+    Stop {
+        /// Whether episodes under way are waited for.
+        drain: bool,
+        /// The way to answer.
+        answer: oneshot::Sender<v1::RunStatus>,
+    },
+    /// Other settings from now on.
+    Set(Arc<Config>, oneshot::Sender<v1::RunStatus>),
 }
 
 /// An actor that is there.
@@ -120,6 +127,8 @@ pub struct Coordinator {
     actors: BTreeMap<ActorId, Actor>,
     next_actor: ActorId,
     state: v1::RunState,
+    /// The run ends when nothing is under way any more.
+    draining: bool,
     standing: Standing,
     epsilon: f32,
     frames_refused: BTreeMap<&'static str, u64>,
@@ -157,6 +166,7 @@ impl Coordinator {
             actors: BTreeMap::new(),
             next_actor: 0,
             state: v1::RunState::Running,
+            draining: false,
             frames_refused: BTreeMap::new(),
             frames: 0,
             batches_in_training: 0,
@@ -189,6 +199,7 @@ impl Coordinator {
                 }
             }
             self.time_waits();
+            self.stop_if_drained();
         }
         self.state = v1::RunState::Stopping;
         self.part_with_actors(&mut events).await;
@@ -326,13 +337,32 @@ impl Coordinator {
             Control::Checkpoint(answer) => {
                 let _ = self.work.send(Work::Checkpoint(answer));
             }
-            Control::Stop(answer) => {
-                tracing::info!("asked to stop");
+            Control::Stop { drain, answer } => {
+                tracing::info!(drain, "asked to stop");
                 self.happened("asked to stop".into());
                 self.state = v1::RunState::Stopping;
-                let _ = self.work.send(Work::Stop);
+                self.draining = drain;
+                if drain {
+                    self.stop_if_drained();
+                } else {
+                    let _ = self.work.send(Work::Stop);
+                }
                 let _ = answer.send(self.status());
             }
+            Control::Set(config, answer) => {
+                self.config = Config::clone(&config);
+                let _ = self.work.send(Work::Set(config));
+                self.happened("settings changed".into());
+                let _ = answer.send(self.status());
+            }
+        }
+    }
+
+    /// Ends the run once nothing is under way any more; batches that are full are trained on first.
+    fn stop_if_drained(&mut self) {
+        if self.draining && self.ledger.counts().outstanding == 0 {
+            self.draining = false;
+            let _ = self.work.send(Work::Stop);
         }
     }
 

@@ -5,6 +5,7 @@
 //! [`coordinator`] owns the [`ledger`]; the gRPC services and the [`web`] page turn calls into its events, by a
 //! [`run_handle`].
 
+pub mod append_file;
 pub mod checkpoint;
 pub mod control_service;
 pub mod coordinator;

@@ -2,6 +2,7 @@
 //! of late.
 
 use crate::{
+    append_file::AppendFile,
     checkpoint::Progress,
     evaluation::{Exploring, TaskResult},
 };
@@ -12,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use std::{
     collections::{BTreeMap, VecDeque},
     fs::{File, OpenOptions},
-    io::{self, Read as _, Seek as _, SeekFrom, Write as _},
+    io::{self, Read as _, Seek as _, SeekFrom},
     path::{Path, PathBuf},
     time::Instant,
 };
@@ -185,7 +186,7 @@ impl From<Losses> for LossLine {
 #[derive(Debug)]
 pub struct MetricsFile {
     path: PathBuf,
-    file: File,
+    file: AppendFile,
     /// Bytes written, as whoever follows the file knows them.
     len: watch::Sender<u64>,
     started: Instant,
@@ -200,9 +201,9 @@ impl MetricsFile {
     /// # Errors
     /// When it cannot be written.
     pub fn open(path: &Path, len: u64, before_s: f64) -> io::Result<Self> {
-        let mut file = OpenOptions::new().create(true).truncate(false).write(true).open(path)?;
-        file.set_len(len.min(file.metadata()?.len()))?;
-        let len = watch::Sender::new(file.seek(SeekFrom::End(0))?);
+        let file = OpenOptions::new().create(true).truncate(false).write(true).open(path)?;
+        let file = AppendFile::new(path.to_owned(), file, len)?;
+        let len = watch::Sender::new(file.written());
         Ok(Self { path: path.to_owned(), file, len, started: Instant::now(), before_s })
     }
 
@@ -226,20 +227,25 @@ impl MetricsFile {
         Follower { path: self.path.clone(), at: 0, len: self.len.subscribe() }
     }
 
-    /// Writes a line at once, so that whoever follows the file sees it whole. A failed write leaves the file as
-    /// it was.
+    /// Writes a line, or keeps it until the disk takes it.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// When the line is no JSON, which none is.
     pub fn write(&mut self, line: &Line) -> io::Result<()> {
         let mut text = serde_json::to_vec(line)?;
         text.push(b'\n');
-        if let Err(error) = self.file.write_all(&text) {
-            self.file.set_len(self.len())?;
-            self.file.seek(SeekFrom::Start(self.len()))?;
-            return Err(error);
-        }
-        self.len.send_modify(|len| *len += text.len() as u64);
+        self.file.append(&text);
+        self.len.send_replace(self.file.written());
+        Ok(())
+    }
+
+    /// Writes what the disk has refused so far.
+    ///
+    /// # Errors
+    /// When it refuses again.
+    pub fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()?;
+        self.len.send_replace(self.file.written());
         Ok(())
     }
 }

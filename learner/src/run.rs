@@ -8,7 +8,7 @@ use crate::{
     receive::receive,
     replay_log::{ReplayLog, ReplayLogError},
     rollout_service::RolloutService,
-    run_handle::RunHandle,
+    run_handle::{RunHandle, SetLog},
     trainer::{Summary, TrainError, Trainer},
     web::{Web, WebError},
     weights::WeightsService,
@@ -105,13 +105,15 @@ pub enum LearnerError {
     Panicked(&'static str),
 }
 
-/// Runs a learner until T_max, until it is told to stop, or until `shutdown`, which means the same.
+/// Runs a learner until T_max, until it is told to stop, or until `shutdown`, which means the same. `set_log` changes
+/// what it logs.
 ///
 /// # Errors
 /// When it cannot begin, or training fails.
 pub async fn run(
     run_dir: RunDir,
     config: Config,
+    set_log: SetLog,
     shutdown: impl Future<Output = ()>,
 ) -> Result<Summary, LearnerError> {
     let doors = listen(&run_dir, &config).await?;
@@ -119,7 +121,8 @@ pub async fn run(
     let rit = Arc::new(Rit::new(config.rit())?);
     let expected = expected(&run_dir, &config);
     let space = RunSpace::new(&run_dir.shared_memory_root())?;
-    let receiver = EpisodeReceiver::create(&space, Limits::new(expected.layout.len(), config.actors.count))?;
+    let limits = Limits::new(expected.layout.len(), config.actors.count.max(config.actors.count_max));
+    let receiver = EpisodeReceiver::create(&space, limits)?;
 
     let (events, event_queue) = async_mpsc::channel(EVENT_QUEUE);
     let (work, work_queue) = mpsc::channel();
@@ -166,7 +169,7 @@ pub async fn run(
         })?
     };
 
-    let handle = RunHandle::new(events.clone(), board.clone(), Arc::new(config), rit);
+    let handle = RunHandle::new(events.clone(), board.clone(), config, run_dir.clone(), rit, set_log);
     let mut serving_web = JoinSet::new();
     if let Some(web) = web {
         tracing::info!(address = %web.address(), "the web page is served");
@@ -209,7 +212,7 @@ pub async fn run(
         () = &mut coordinating => {}
         () = &mut shutdown => {
             let (answer, _) = oneshot::channel();
-            let _ = events.send(Event::Control(crate::coordinator::Control::Stop(answer))).await;
+            let _ = events.send(Event::Control(crate::coordinator::Control::Stop { drain: false, answer })).await;
             coordinating.await;
         }
     }

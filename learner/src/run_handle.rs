@@ -7,15 +7,18 @@ use crate::{
     weights::{Snapshot, WeightsBoard},
 };
 use rit_algo::{Acting, Rit};
-use rit_config::Config;
+use rit_config::{Config, ConfigError, RunDir, RunDirError, set, set_live};
 use rit_env::{Scene, TaskSet, UnknownName};
 use rit_episode::{Episode, RunSeed};
 use rit_proto::v1;
 use std::sync::Arc;
 use tokio::{
-    sync::{Semaphore, mpsc, oneshot},
+    sync::{Mutex, Semaphore, mpsc, oneshot, watch},
     task::JoinError,
 };
+
+/// Changes what this process logs, or says why it cannot.
+pub type SetLog = Arc<dyn Fn(&str) -> Result<(), String> + Send + Sync>;
 
 /// Why a question has no answer.
 #[derive(Debug, thiserror::Error)]
@@ -29,6 +32,15 @@ pub enum AskError {
     /// A split without tasks.
     #[error("{0} has no such tasks")]
     NoTasks(TaskSet),
+    /// A setting that cannot be.
+    #[error(transparent)]
+    Setting(#[from] ConfigError),
+    /// A filter for logs that means nothing.
+    #[error("log: {0}")]
+    Log(String),
+    /// The settings were not written down.
+    #[error(transparent)]
+    RunDir(#[from] RunDirError),
     /// The checkpoint was not written.
     #[error("{0}")]
     Checkpoint(String),
@@ -49,11 +61,15 @@ pub struct Watched {
 }
 
 /// A way to speak to a running learner.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 pub struct RunHandle {
     events: mpsc::Sender<Event>,
     board: Arc<WeightsBoard>,
-    config: Arc<Config>,
+    config: watch::Sender<Arc<Config>>,
+    /// One change of it at a time.
+    setting: Arc<Mutex<()>>,
+    run_dir: RunDir,
+    set_log: SetLog,
     rit: Arc<Rit>,
     /// One caller's episodes at a time: training goes on beside them.
     rollouts: Arc<Semaphore>,
@@ -64,15 +80,39 @@ impl RunHandle {
     pub fn new(
         events: mpsc::Sender<Event>,
         board: Arc<WeightsBoard>,
-        config: Arc<Config>,
+        config: Config,
+        run_dir: RunDir,
         rit: Arc<Rit>,
+        set_log: SetLog,
     ) -> Self {
-        Self { events, board, config, rit, rollouts: Arc::new(Semaphore::new(1)) }
+        let config = watch::Sender::new(Arc::new(config));
+        let setting = Arc::default();
+        Self { events, board, config, setting, run_dir, set_log, rit, rollouts: Arc::new(Semaphore::new(1)) }
     }
 
-    /// The run's configuration.
-    pub fn config(&self) -> &Config {
-        &self.config
+    /// The run's configuration as it is now.
+    pub fn config(&self) -> Arc<Config> {
+        Arc::clone(&self.config.borrow())
+    }
+
+    /// Changes settings while the run goes on, and writes them into the run directory.
+    ///
+    /// # Errors
+    /// When a setting is wrong or cannot change now, when it cannot be written down, or when the run is over.
+    pub async fn set(&self, request: v1::SetRequest) -> Result<v1::RunStatus, AskError> {
+        let v1::SetRequest { settings, log } = request;
+        let _one_at_a_time = self.setting.lock().await;
+        let tables: Vec<_> =
+            settings.iter().map(|(key, value)| set(&format!("{key}={value}"))).collect::<Result<_, _>>()?;
+        let config = Arc::new(set_live(&self.config(), &tables)?);
+        if !log.is_empty() {
+            (self.set_log)(&log).map_err(AskError::Log)?;
+        }
+        self.run_dir.write_config(&config)?;
+        let status = self.ask(|answer| Control::Set(Arc::clone(&config), answer)).await?;
+        self.config.send_replace(config);
+        tracing::info!(?settings, log, "settings changed");
+        Ok(status)
     }
 
     /// Asks the coordinator.
@@ -108,16 +148,17 @@ impl RunHandle {
     /// When there are no such tasks.
     pub async fn evaluate(&self, request: v1::EvaluateRequest) -> Result<v1::Evaluation, AskError> {
         let v1::EvaluateRequest { tasks, episodes, seed } = request;
-        let evaluator = Evaluator::new(&self.config);
+        let config = self.config();
+        let evaluator = Evaluator::new(&config);
         let tasks = evaluator.tasks(&tasks)?;
         if tasks.is_empty() {
-            return Err(AskError::NoTasks(self.config.environment.task_set));
+            return Err(AskError::NoTasks(config.environment.task_set));
         }
         let episodes = match episodes as usize {
-            0 => self.config.evaluation.episodes,
+            0 => config.evaluation.episodes,
             episodes => episodes,
         };
-        let seed = seed.map_or_else(|| evaluation_seed(&self.config), RunSeed);
+        let seed = seed.map_or_else(|| evaluation_seed(&config), RunSeed);
         self.roll(move |acting, snapshot| {
             let results = evaluator.evaluate(acting, &tasks, episodes, seed);
             v1::Evaluation {
@@ -134,9 +175,10 @@ impl RunHandle {
     /// # Errors
     /// When there is no such task.
     pub async fn watch(&self, task: &str, number: u64) -> Result<Watched, AskError> {
-        let evaluator = Evaluator::new(&self.config);
-        let task = self.config.environment.task_set.task(task)?;
-        let seed = evaluation_seed(&self.config);
+        let config = self.config();
+        let evaluator = Evaluator::new(&config);
+        let task = config.environment.task_set.task(task)?;
+        let seed = evaluation_seed(&config);
         self.roll(move |acting, snapshot| {
             let (mut scenes, one) = (Vec::new(), number..number + 1);
             let mut episodes =

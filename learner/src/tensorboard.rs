@@ -5,14 +5,14 @@
 //! checkpoint first cuts away what was written behind it, so that there is one point a step. Each file begins with a
 //! session's start: a TensorBoard that is running then forgets what it had seen from that step on.
 
-use crate::{evaluation::TaskResult, metrics::Line};
+use crate::{append_file::AppendFile, evaluation::TaskResult, metrics::Line};
 use crc::{CRC_32_ISCSI, Crc};
 use prost::Message;
 use serde::{Deserialize, Serialize};
 use std::{
     collections::BTreeMap,
-    fs::{self, DirBuilder, File, OpenOptions},
-    io::{self, Seek as _, SeekFrom, Write as _},
+    fs::{self, DirBuilder, OpenOptions},
+    io,
     os::unix::fs::{DirBuilderExt as _, OpenOptionsExt as _},
     path::Path,
     time::{SystemTime, UNIX_EPOCH},
@@ -35,8 +35,8 @@ pub struct Position {
 /// Writes one event file.
 #[derive(Debug)]
 pub struct EventFile {
-    file: File,
-    position: Position,
+    file: AppendFile,
+    name: String,
 }
 
 impl EventFile {
@@ -65,37 +65,37 @@ impl EventFile {
             newest = newest.max(number);
         }
         let name = format!("{PREFIX}{:010}", (wall_time() as u64).max(newest + 1));
-        let file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(folder.join(&name))?;
-        let mut events = Self { file, position: Position { file: name, len: 0 } };
-        events.append(0, What::FileVersion("brain.Event:2".into()))?;
+        let path = folder.join(&name);
+        let file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&path)?;
+        let mut events = Self { file: AppendFile::new(path, file, 0)?, name };
+        events.append(0, What::FileVersion("brain.Event:2".into()));
         let start = SessionLog { status: SessionStatus::Start.into() };
-        events.append(from_env_steps, What::SessionLog(start))?;
+        events.append(from_env_steps, What::SessionLog(start));
+        events.file.flush()?;
         Ok(events)
     }
 
     /// How far the files go.
-    pub fn position(&self) -> &Position {
-        &self.position
+    pub fn position(&self) -> Position {
+        Position { file: self.name.clone(), len: self.file.written() }
     }
 
-    /// Writes what a line says. A failed write leaves the file as it was.
+    /// Writes what a line says, or keeps it until the disk takes it.
+    pub fn write(&mut self, line: &Line) {
+        self.append(line.progress().env_steps, What::Summary(summary(line)));
+    }
+
+    /// Writes what the disk has refused so far.
     ///
     /// # Errors
-    /// When the disk refuses.
-    pub fn write(&mut self, line: &Line) -> io::Result<()> {
-        self.append(line.progress().env_steps, What::Summary(summary(line)))
+    /// When it refuses again.
+    pub fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
     }
 
-    fn append(&mut self, env_steps: u64, what: What) -> io::Result<()> {
+    fn append(&mut self, env_steps: u64, what: What) {
         let event = Event { wall_time: wall_time(), step: env_steps as i64, what: Some(what) };
-        let record = record(&event.encode_to_vec());
-        if let Err(error) = self.file.write_all(&record) {
-            self.file.set_len(self.position.len)?;
-            self.file.seek(SeekFrom::Start(self.position.len))?;
-            return Err(error);
-        }
-        self.position.len += record.len() as u64;
-        Ok(())
+        self.file.append(&record(&event.encode_to_vec()));
     }
 }
 
@@ -265,7 +265,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let folder = folder.path().join("tensorboard");
         let mut events = EventFile::create(&folder, &Position::default(), 0).unwrap();
-        events.write(&evaluation(0)).unwrap();
+        events.write(&evaluation(0));
         let losses = LossLine {
             td_loss: 0.5,
             contrastive_loss: 0.25,
@@ -278,7 +278,7 @@ mod tests {
             TaskResult { task: String::new(), episodes: 9, mean_return: 4.5, win_rate: None, exploring };
         let tasks = BTreeMap::from([("3v3".to_owned(), result)]);
         let line = Line::Training { progress: progress(100), wall_s: 2.0, epsilon: 0.125, losses, tasks };
-        events.write(&line).unwrap();
+        events.write(&line);
         let files = read_all(&folder);
         assert_eq!(files.len(), 1);
         assert_eq!(files[0][0].what, Some(What::FileVersion("brain.Event:2".into())));
@@ -306,14 +306,14 @@ mod tests {
     fn no_step_is_there_twice_after_resuming() {
         let folder = tempfile::tempdir().unwrap();
         let mut first = EventFile::create(folder.path(), &Position::default(), 0).unwrap();
-        first.write(&evaluation(10)).unwrap();
+        first.write(&evaluation(10));
         let at_checkpoint = first.position().clone();
-        first.write(&evaluation(20)).unwrap();
+        first.write(&evaluation(20));
         // A learner that goes on from there, and dies before its first checkpoint.
         let mut second = EventFile::create(folder.path(), &at_checkpoint, 11).unwrap();
-        second.write(&evaluation(20)).unwrap();
+        second.write(&evaluation(20));
         let mut third = EventFile::create(folder.path(), &at_checkpoint, 11).unwrap();
-        third.write(&evaluation(20)).unwrap();
+        third.write(&evaluation(20));
         assert!(third.position().file > second.position().file, "a name that was never used");
         let files = read_all(folder.path());
         let steps: Vec<Vec<i64>> =

@@ -32,6 +32,8 @@ pub enum Work {
     Batch(Vec<Episode>),
     /// Write a checkpoint now.
     Checkpoint(oneshot::Sender<Checkpointed>),
+    /// Go on with other settings.
+    Set(Arc<Config>),
     /// End the run.
     Stop,
 }
@@ -263,6 +265,14 @@ impl Trainer {
                     // Whoever asked may have gone.
                     let _ = answer.send(Checkpointed { progress, weights_digest, written });
                 }
+                Work::Set(config) => {
+                    let other_result = self.config.algorithm != config.algorithm;
+                    self.config = Config::clone(&config);
+                    if other_result {
+                        // What was trained so far is not trained again under other settings.
+                        self.checkpoint(None);
+                    }
+                }
                 Work::Stop => break,
             }
         }
@@ -337,9 +347,8 @@ impl Trainer {
 
     fn measured(&mut self, line: &Line) -> Result<(), TrainError> {
         self.metrics.write(line).map_err(|error| TrainError::Io { path: self.run_dir.metrics(), error })?;
-        self.tensorboard
-            .write(line)
-            .map_err(|error| TrainError::Io { path: self.run_dir.tensorboard(), error })
+        self.tensorboard.write(line);
+        Ok(())
     }
 
     fn greedy(&self, episodes: usize) -> Vec<TaskResult> {
@@ -362,7 +371,9 @@ impl Trainer {
     }
 
     /// Hands a copy of everything to the writer. Returns the weights' digest.
-    fn checkpoint(&self, done: Option<oneshot::Sender<Written>>) -> String {
+    fn checkpoint(&mut self, done: Option<oneshot::Sender<Written>>) -> String {
+        // What the disk still refuses, it will refuse the checkpoint too, which then says so.
+        let _ = self.metrics.flush().and_then(|()| self.tensorboard.flush());
         let weights_digest = weights_file::digest(&self.update.params);
         let kept = self.board.all_kept();
         let mark = |snapshot: &Arc<Snapshot>| SnapshotMark {
@@ -385,7 +396,7 @@ impl Trainer {
                 recent: self.recent.windows(),
                 exploring: self.recent.exploring().to_vec(),
                 metrics_len: self.metrics.len(),
-                tensorboard: self.tensorboard.position().clone(),
+                tensorboard: self.tensorboard.position(),
                 wall_s: self.metrics.wall_s(),
                 evaluation,
                 weights_digest: weights_digest.clone(),
@@ -397,7 +408,7 @@ impl Trainer {
         weights_digest
     }
 
-    fn finish(self) -> Result<Summary, TrainError> {
+    fn finish(mut self) -> Result<Summary, TrainError> {
         let (done, written) = oneshot::channel();
         let weights_digest = self.checkpoint(Some(done));
         let results = self.greedy(self.config.evaluation.episodes);

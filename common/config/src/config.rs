@@ -167,6 +167,7 @@ pub struct Checkpoints {
 #[allow(missing_docs, reason = "presets/all.toml documents every key, for users too")]
 pub struct Actors {
     pub count: usize,
+    pub count_max: usize,
     pub remote: usize,
     pub episodes_at_once: usize,
     pub heartbeat_timeout_ms: u64,
@@ -344,6 +345,7 @@ impl Config {
             ("checkpoints.every_env_steps", self.checkpoints.every_env_steps as f64, 1.0, STEPS),
             ("checkpoints.keep", self.checkpoints.keep as f64, 1.0, COUNT),
             ("actors.count", self.actors.count as f64, 0.0, 256.0),
+            ("actors.count_max", self.actors.count_max as f64, 1.0, 256.0),
             ("actors.remote", self.actors.remote as f64, 0.0, 256.0),
             ("actors.episodes_at_once", self.actors.episodes_at_once as f64, 1.0, 4096.0),
             ("actors.heartbeat_timeout_ms", self.actors.heartbeat_timeout_ms as f64, 2000.0, 3_600_000.0),

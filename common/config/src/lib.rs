@@ -12,5 +12,5 @@ pub use config::{
     Actors, Algorithm, Checkpoints, Config, Environment, Evaluation, Learner, MixingKind, Network,
     OptimizerName, Tls, Training, Until, Web, WebListen,
 };
-pub use resolve::{ConfigError, resolve, set};
+pub use resolve::{ConfigError, resolve, set, set_live};
 pub use run_dir::{RunDir, RunDirError};

@@ -61,6 +61,12 @@ pub enum ConfigError {
         /// The key.
         key: String,
     },
+    /// A key that a running learner cannot change.
+    #[error("{key} cannot change while the learner runs; these can: {}", LIVE.join(", "))]
+    NotLive {
+        /// The key.
+        key: String,
+    },
     /// Values that cannot go together.
     #[error("{0}")]
     Model(#[from] rit_algo::ConfigError),
@@ -130,11 +136,44 @@ const FREE: [&str; 10] = [
     "web",
 ];
 
+/// Keys that a running learner can change. Of these only `algorithm.epsilon_finish` changes the result.
+const LIVE: [&str; 7] = [
+    "algorithm.epsilon_finish",
+    "evaluation.every_env_steps",
+    "evaluation.episodes",
+    "checkpoints.every_env_steps",
+    "actors.count",
+    "actors.heartbeat_timeout_ms",
+    "learner.metrics_every_env_steps",
+];
+
+/// The configuration of a running learner with these settings.
+///
+/// # Errors
+/// The first thing found wrong, or a key that cannot change now.
+pub fn set_live(config: &Config, settings: &[Table]) -> Result<Config, ConfigError> {
+    let new = resolve(&config.to_toml()?, "the run's configuration", settings)?;
+    if let Some(key) = first_difference(config, &new, &LIVE)? {
+        return Err(ConfigError::NotLive { key });
+    }
+    let (count, max) = (new.actors.count, new.actors.count_max);
+    if count > max.max(config.actors.count) {
+        let (key, value, max) = ("actors.count", count as f64, max as f64);
+        return Err(ConfigError::Range { key, value, min: 0.0, max });
+    }
+    Ok(new)
+}
+
 /// Whether a run of the one configuration may go on as one of the other.
 ///
 /// # Errors
 /// The first key that differs and may not.
 pub(crate) fn may_go_on(old: &Config, new: &Config) -> Result<(), ConfigError> {
+    first_difference(old, new, &FREE)?.map_or(Ok(()), |key| Err(ConfigError::Fixed { key }))
+}
+
+/// The first key outside these keys and sections that differs.
+fn first_difference(old: &Config, new: &Config, free: &[&str]) -> Result<Option<String>, ConfigError> {
     let table =
         |config: &Config| Table::try_from(config).map_err(|error| ConfigError::Value(error.to_string()));
     let (old, new) = (table(old)?, table(new)?);
@@ -155,9 +194,9 @@ pub(crate) fn may_go_on(old: &Config, new: &Config) -> Result<(), ConfigError> {
         keys
     };
     let (old, new) = (keys(&old), keys(&new));
-    let free = |key: &str| FREE.iter().any(|free| key == *free || key.starts_with(&format!("{free}.")));
-    let fixed = old.iter().find(|(key, value)| new.get(*key) != Some(value) && !free(key));
-    fixed.map_or(Ok(()), |(key, _)| Err(ConfigError::Fixed { key: key.clone() }))
+    let is_free = |key: &str| free.iter().any(|free| key == *free || key.starts_with(&format!("{free}.")));
+    let mut differing = old.iter().filter(|(key, value)| new.get(*key) != Some(value));
+    Ok(differing.find(|(key, _)| !is_free(key)).map(|(key, _)| key.clone()))
 }
 
 fn parse(text: &str, source_name: &str) -> Result<Table, ConfigError> {

@@ -137,12 +137,21 @@ impl RunDir {
         let new = resolve(&text, "config.toml", settings).map_err(wrong)?;
         may_go_on(&old, &new).map_err(wrong)?;
         if new != old {
-            let partial = path.with_extension("partial");
-            fs::write(&partial, toml::to_string(&new)?)
-                .and_then(|()| fs::rename(&partial, &path))
-                .map_err(io)?;
+            run_dir.write_config(&new)?;
         }
         Ok((run_dir, new))
+    }
+
+    /// Writes another configuration down, as a whole or not at all.
+    ///
+    /// # Errors
+    /// When it cannot be written.
+    pub fn write_config(&self, config: &Config) -> Result<(), RunDirError> {
+        let path = self.config_path();
+        let partial = path.with_extension("partial");
+        fs::write(&partial, toml::to_string(config)?)
+            .and_then(|()| fs::rename(&partial, &path))
+            .map_err(|error| RunDirError::Io { path, error })
     }
 
     /// The directory itself, absolute.

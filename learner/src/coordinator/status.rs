@@ -48,6 +48,7 @@ impl Coordinator {
             shared_memory_bytes: self.frames * frame_bytes as u64,
             checkpoints: Some(self.checkpoints),
             happenings: self.happenings.list(),
+            actors_wanted: self.config.actors.count as u32,
         }
     }
 

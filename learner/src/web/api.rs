@@ -37,7 +37,10 @@ pub fn router() -> Router<Page> {
         .route("/metrics", get(prometheus))
         .route("/api/pause", post(async |State(page)| tell(page, Control::Pause).await))
         .route("/api/resume", post(async |State(page)| tell(page, Control::Resume).await))
-        .route("/api/stop", post(async |State(page)| tell(page, Control::Stop).await))
+        .route(
+            "/api/stop",
+            post(async |State(page)| tell(page, |answer| Control::Stop { drain: false, answer }).await),
+        )
         .route("/api/checkpoint", post(checkpoint))
         .route("/api/evaluate", post(evaluate))
         .route("/api/watch", post(watch))
@@ -78,7 +81,8 @@ impl IntoResponse for ApiError {
                 StatusCode::BAD_REQUEST
             }
             Self::Ask(AskError::Over) => StatusCode::SERVICE_UNAVAILABLE,
-            Self::Ask(AskError::Checkpoint(_) | AskError::Rollout(_)) | Self::Io(_) => {
+            Self::Ask(AskError::Setting(_) | AskError::Log(_)) => StatusCode::BAD_REQUEST,
+            Self::Ask(AskError::Checkpoint(_) | AskError::Rollout(_) | AskError::RunDir(_)) | Self::Io(_) => {
                 StatusCode::INTERNAL_SERVER_ERROR
             }
         };

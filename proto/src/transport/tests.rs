@@ -46,6 +46,9 @@ impl control_server::Control for Patient {
     async fn stop(&self, _: Request<v1::StopRequest>) -> Answer<v1::RunStatus> {
         Err(Status::unimplemented(""))
     }
+    async fn set(&self, _: Request<v1::SetRequest>) -> Answer<v1::RunStatus> {
+        Err(Status::unimplemented(""))
+    }
     type MetricsStream = tokio_stream::Pending<Result<v1::MetricsUpdate, Status>>;
     async fn metrics(&self, _: Request<v1::MetricsRequest>) -> Answer<Self::MetricsStream> {
         Err(Status::unimplemented(""))
