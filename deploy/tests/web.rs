@@ -407,7 +407,9 @@ impl Drop for Browser {
                 stream,
                 "DELETE /session/{session} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n"
             );
-            let _ = stream.read_to_string(&mut String::new());
+            // The answer comes when the browser has gone; the driver leaves the connection open.
+            let _ = stream.set_read_timeout(Some(DEADLINE));
+            let _ = stream.read(&mut [0; 512]);
         }
         kill(self.driver.id(), Signal::TERM);
         let _ = self.driver.wait();
