@@ -86,7 +86,8 @@ fn settings_change_while_the_run_goes_on() {
 
     train.ctl(&["set", "algorithm.epsilon_finish=0.25"]);
     train.wait_for("epsilon on its way to the new floor", |status| {
-        let (env_steps, epsilon) = (status["env_steps"].as_f64().unwrap(), status["epsilon"].as_f64().unwrap());
+        let (env_steps, epsilon) =
+            (status["env_steps"].as_f64().unwrap(), status["epsilon"].as_f64().unwrap());
         // To 0.05 it would be 0.008 lower at least.
         env_steps > 2000.0 && (epsilon - (1.0 - 0.75 * env_steps / 50_000.0)).abs() < 0.003
     });
