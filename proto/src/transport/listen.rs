@@ -12,7 +12,7 @@ use std::{
     pin::Pin,
     sync::Arc,
     task::{Context, Poll},
-    time::Duration,
+    time::{Duration, Instant},
 };
 use tokio::{
     io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, ReadBuf},
@@ -29,6 +29,12 @@ const SOCKET_PATH_MAX: usize = 107;
 /// How long nothing is accepted after the system could not: without a pause, running out of files would take all CPU
 /// time too.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+
+/// How long a learner that was killed may take to be gone.
+const DYING_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// From one look whether it is to the next.
+const DYING_POLL: Duration = Duration::from_millis(20);
 
 /// Refusals that are remembered as logged.
 const LOGGED_MAX: usize = 1000;
@@ -142,7 +148,7 @@ impl Incoming {
             Ok(metadata) if !metadata.file_type().is_socket() => {
                 return Err(ListenError::NotASocket(path.to_owned()));
             }
-            Ok(_) if UnixStream::connect(path).await.is_ok() => return Err(ListenError::InUse(address)),
+            Ok(_) if is_answered(path).await => return Err(ListenError::InUse(address)),
             // Nobody answers: its learner is dead.
             Ok(_) => fs::remove_file(path).map_err(io)?,
         }
@@ -231,6 +237,18 @@ impl Drop for Incoming {
             let _ = fs::remove_file(path);
         }
     }
+}
+
+/// Whether a learner listens there. One that has just been killed does for a moment more.
+async fn is_answered(path: &Path) -> bool {
+    let begun = Instant::now();
+    while UnixStream::connect(path).await.is_ok() {
+        if begun.elapsed() >= DYING_TIMEOUT {
+            return true;
+        }
+        tokio::time::sleep(DYING_POLL).await;
+    }
+    false
 }
 
 /// Whether a process of the same user calls.

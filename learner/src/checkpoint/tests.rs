@@ -1,0 +1,128 @@
+use super::*;
+use rit_episode::{RunSeed, Stream, wire::PayloadLayout};
+
+struct Run {
+    _folder: tempfile::TempDir,
+    run_dir: RunDir,
+    rit: Rit,
+}
+
+fn run() -> Run {
+    let config = rit_config::resolve("environment.task_set = \"matrix-game\"", "test", &[]).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let run_dir = RunDir::create(&folder.path().join("run"), &config).unwrap();
+    Run { _folder: folder, run_dir, rit: Rit::new(config.rit()).unwrap() }
+}
+
+impl Run {
+    /// A state whose numbers tell which it is. It needs no replay.
+    fn state(&self, env_steps: u64) -> TrainingState {
+        let numbers = |len: usize, index: u64| -> Vec<f32> {
+            let layout = self.rit.layout.initial(&mut RunSeed(env_steps).stream(Stream::Weights, index));
+            layout.into_iter().cycle().take(len).collect()
+        };
+        let params = numbers(self.rit.layout.len(), 0);
+        let acting = numbers(self.rit.acting().len(), 1);
+        TrainingState {
+            target: numbers(self.rit.target().len(), 2),
+            mean: vec![],
+            mean_square: numbers(params.len(), 3),
+            snapshots: vec![Snapshot::new(4, 90, &acting), Snapshot::new(5, 100, &acting)],
+            manifest: Manifest {
+                progress: Progress { env_steps, episodes: 0, updates: 5 },
+                target_copied_at: 3,
+                terms: vec![Terms { weights_version: 4, epsilon: 0.1 + 0.2 }],
+                snapshots: [(4, 90), (5, 100)]
+                    .map(|(version, env_steps)| SnapshotMark { version, env_steps })
+                    .to_vec(),
+                recent: vec![vec![(0.1 + 0.2, true)], vec![]],
+                exploring: vec![Exploring { episodes_total: 9, policy_lag: 1 }],
+                metrics_len: 77,
+                tensorboard: Position { file: "events".into(), len: 55 },
+                wall_s: 1.5,
+                evaluation: None,
+                weights_digest: weights_file::digest(&params),
+            },
+            params,
+        }
+    }
+
+    fn save(&self, env_steps: u64) -> PathBuf {
+        self.run_dir.root().join(save(&self.run_dir, &self.rit, &self.state(env_steps), 3).unwrap())
+    }
+
+    fn load(&self) -> Result<Option<Loaded>, CheckpointError> {
+        let dims = rit_env::TaskSet::MatrixGame.dims();
+        let layout = PayloadLayout::new(dims);
+        let expected = Expected { run_id: self.run_dir.run_id(), layout, tasks: vec![] };
+        load_newest(&self.run_dir, &self.rit, &expected, 10)
+    }
+}
+
+#[test]
+fn a_state_comes_back_whole_and_latest_is_the_newest() {
+    let run = run();
+    assert!(run.load().unwrap().is_none(), "none was ever written");
+    run.save(50);
+    run.save(100);
+    let loaded = run.load().unwrap().unwrap();
+    assert_eq!(loaded.state, run.state(100));
+    assert!(loaded.damaged.is_empty());
+    let latest = run.run_dir.checkpoints().join(LATEST);
+    assert_eq!(load(&latest, &run.rit).unwrap(), run.state(100));
+    run.save(100);
+    assert_eq!(run.load().unwrap().unwrap().state, run.state(100), "once more by request");
+}
+
+#[test]
+fn only_the_last_few_are_kept() {
+    let run = run();
+    for env_steps in [10, 20, 30, 40, 50] {
+        run.save(env_steps);
+    }
+    let kept = folders(&run.run_dir.checkpoints()).unwrap();
+    let names: Vec<_> = kept.iter().map(|path| path.file_name().unwrap().to_str().unwrap()).collect();
+    assert_eq!(names, ["step-000000000030", "step-000000000040", "step-000000000050"]);
+}
+
+#[test]
+fn a_damaged_newest_is_reported_and_the_one_before_is_used() {
+    for name in [WEIGHTS, STATE, MANIFEST, SUMS] {
+        let run = run();
+        run.save(10);
+        let newest = run.save(20);
+        let path = newest.join(name);
+        let mut bytes = fs::read(&path).unwrap();
+        let middle = bytes.len() / 2;
+        bytes[middle] ^= 1;
+        fs::write(&path, bytes).unwrap();
+        let loaded = run.load().unwrap().unwrap();
+        assert_eq!(loaded.state, run.state(10), "{name}");
+        assert!(loaded.damaged[0].to_string().contains("was altered"), "{name}: {}", loaded.damaged[0]);
+        fs::remove_file(&path).unwrap();
+        assert!(run.load().unwrap().unwrap().damaged[0].to_string().contains("No such file"), "{name}");
+    }
+}
+
+#[test]
+fn what_was_half_written_is_nothing() {
+    let run = run();
+    run.save(10);
+    let partial = run.run_dir.checkpoints().join("step-000000000020.partial");
+    fs::create_dir(&partial).unwrap();
+    fs::write(partial.join(WEIGHTS), "half").unwrap();
+    let loaded = run.load().unwrap().unwrap();
+    assert_eq!((loaded.state, loaded.damaged.len()), (run.state(10), 0));
+    run.save(20);
+    assert_eq!(run.load().unwrap().unwrap().state, run.state(20));
+}
+
+#[test]
+fn never_a_silent_fresh_start() {
+    let run = run();
+    for folder in [run.save(10), run.save(20)] {
+        fs::write(folder.join(SUMS), "").unwrap();
+    }
+    let message = run.load().unwrap_err().to_string();
+    assert!(message.contains("no checkpoint in") && message.contains("step-000000000020"), "{message}");
+}
