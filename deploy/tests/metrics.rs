@@ -57,7 +57,8 @@ fn a_follower_gets_every_line_until_the_run_is_over() {
 }
 
 /// Reads nothing until far more lines have been written than its connection holds.
-#[tokio::test]
+// On threads of their own, connections answer pings while the test waits.
+#[tokio::test(flavor = "multi_thread")]
 async fn a_slow_reader_misses_statuses_alone_and_training_does_not_wait() {
     let folder = RunFolder::new();
     let mut train = folder.start(RUN);
@@ -83,7 +84,7 @@ async fn a_slow_reader_misses_statuses_alone_and_training_does_not_wait() {
     train.finish();
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread")]
 async fn a_status_accounts_for_everything() {
     let folder = RunFolder::new();
     let mut train = folder.start(&[RUN, &["--actors", "2", "--set", "algorithm.buffer_size=100"]].concat());

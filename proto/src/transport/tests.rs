@@ -3,7 +3,7 @@
 use super::{connect::EveryCall, *};
 use crate::v1::{self, control_client::ControlClient, control_server};
 use rcgen::{
-    BasicConstraints, CertificateParams, CertifiedIssuer, ExtendedKeyUsagePurpose, IsCa, KeyPair,
+    BasicConstraints, CertificateParams, CertifiedIssuer, DnType, ExtendedKeyUsagePurpose, IsCa, KeyPair,
     date_time_ymd,
 };
 use std::{
@@ -105,6 +105,7 @@ impl Pki {
     fn authority(&self, name: &str) -> (PathBuf, CertifiedIssuer<'static, KeyPair>) {
         let mut params = CertificateParams::new([]).unwrap();
         params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+        params.distinguished_name.push(DnType::CommonName, name);
         let authority = CertifiedIssuer::self_signed(params, KeyPair::generate().unwrap()).unwrap();
         (self.file(name, &authority.pem()), authority)
     }
