@@ -259,8 +259,14 @@ fn kind(value: &Value) -> &'static str {
     }
 }
 
+/// Longest key that is compared with the known ones: comparing takes time in proportion to the length.
+const COMPARED_LEN_MAX: usize = 100;
+
 /// The known key that looks most like this one, if any does.
 fn closest(key: &str) -> Option<String> {
+    if key.len() > COMPARED_LEN_MAX {
+        return None;
+    }
     let mut known = Vec::new();
     if let Ok(defaults) = parse(include_str!("presets/all.toml"), "presets/all.toml") {
         for (section, value) in &defaults {
@@ -347,6 +353,8 @@ mod tests {
         );
         assert_eq!(message(&["gamma=0.9"]), "unknown key \"gamma\"; did you mean \"algorithm.gamma\"?");
         assert_eq!(message(&["zzz.qqq=1"]), "unknown key \"zzz\"");
+        let endless = "gamma".repeat(1_000_000);
+        assert_eq!(message(&[&format!("{endless}=1")]), format!("unknown key \"{endless}\""));
         assert_eq!(
             message(&["algorithm.gamma=high"]),
             "algorithm.gamma must be a number, not a word in quotes"
