@@ -112,7 +112,8 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
 /// # Errors
 /// When there is no `=` or no key.
 pub fn set(assignment: &str) -> Result<Table, ConfigError> {
-    let source_name = || format!("--set {assignment}");
+    // Whatever a shell lets through, the message is one line.
+    let source_name = || format!("--set {}", assignment.replace(char::is_control, " "));
     let Some((key, value)) = assignment.split_once('=') else {
         let reason = "write --set section.key=value".to_owned();
         return Err(ConfigError::Syntax { source_name: source_name(), reason });
@@ -382,5 +383,7 @@ mod tests {
             resolve("a = = b", "my.toml", &[]).unwrap_err().to_string().starts_with("my.toml is not TOML: ")
         );
         assert!(set("algorithm.gamma").unwrap_err().to_string().contains("section.key=value"));
+        let two_lines = set("seed\n8").unwrap_err().to_string();
+        assert_eq!(two_lines, "--set seed 8 is not TOML: write --set section.key=value");
     }
 }
