@@ -113,6 +113,7 @@ impl Run {
         accepted
     }
 
+    #[allow(clippy::panic, reason = "that is how a fuzzer learns of it")]
     fn load(&self) -> bool {
         let loaded =
             checkpoint::load_newest(&self.run_dir, &self.rit, &self.expected, &self.config.algorithm);
