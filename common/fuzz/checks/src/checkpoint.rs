@@ -10,8 +10,10 @@ use rit_episode::{
 };
 use rit_learner::{
     checkpoint::{self, Manifest, Progress, SnapshotMark, TrainingState},
+    evaluation::Exploring,
     ledger::{Ledger, Terms},
     replay_log::ReplayLog,
+    tensorboard::Position,
     trainer::{TrainError, Trainer, Work},
     weights::Snapshot,
     weights_file,
@@ -208,7 +210,9 @@ fn state(rit: &Rit, config: &Config) -> TrainingState {
                 .map(|version| SnapshotMark { version, env_steps: 2 * version })
                 .collect(),
             recent: vec![vec![(88.0, true)], vec![(-3.5, false), (0.0, false)], vec![], vec![]],
+            exploring: vec![Exploring { episodes_total: 2, policy_lag: 1 }; 4],
             metrics_len: 100,
+            tensorboard: Position::default(),
             wall_s: 1.5,
             evaluation: None,
             weights_digest: weights_file::digest(&params),
