@@ -8,7 +8,11 @@ use common::{
 };
 use rustix::process::Signal;
 use serde_json::Value;
-use std::{fs, sync::LazyLock};
+use std::{
+    fs,
+    process::{Command, Stdio},
+    sync::LazyLock,
+};
 
 /// 400 episodes; replay of 100, so that checkpoints in the middle have to bring back part of it.
 const RUN: &[&str] = &[
@@ -197,4 +201,37 @@ fn what_would_change_the_result_cannot_change() {
     assert_eq!(refused.status.code(), Some(2));
     let stderr = String::from_utf8_lossy(&refused.stderr);
     assert!(stderr.contains("algorithm.gamma cannot change in a run that has begun"), "{stderr}");
+}
+
+/// `deploy/rit-run.sh`, which service managers call again and again.
+#[test]
+fn the_same_command_begins_a_run_and_goes_on_with_it() {
+    let folder = RunFolder::new();
+    let run = |arguments: &[&str]| {
+        let script = concat!(env!("CARGO_MANIFEST_DIR"), "/rit-run.sh");
+        let mut command = Command::new(script);
+        command.arg(folder.run_dir()).args(arguments).env("RIT", env!("CARGO_BIN_EXE_rit"));
+        let output = command.stdin(Stdio::null()).output().unwrap();
+        (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+    };
+    let summary = || {
+        let text = fs::read_to_string(folder.run_dir().join("summary.json")).unwrap();
+        serde_json::from_str::<Value>(&text).unwrap()
+    };
+    let (code, stderr) = run(&[]);
+    assert_eq!(code, Some(2), "{stderr}");
+    assert!(stderr.starts_with("usage: "), "{stderr}");
+
+    let command = ["matrix-game", "--steps", "300", "--seed", "3"];
+    let (code, stderr) = run(&command);
+    assert_eq!(code, Some(0), "{stderr}");
+    let first = summary();
+    let (code, stderr) = run(&command);
+    assert_eq!(code, Some(0), "{stderr}");
+    assert!(stderr.contains("going on with matrix-game"), "{stderr}");
+    let second = summary();
+    assert_eq!(
+        (&first["env_steps"], &first["weights_digest"]),
+        (&second["env_steps"], &second["weights_digest"])
+    );
 }

@@ -13,19 +13,19 @@
 //! place: they follow from the seed and the progress. A folder is written beside its place, made durable and
 //! then renamed there, so it is whole or not there. `checkpoints/latest` is a link to the newest.
 
+mod manifest;
+
+pub use manifest::{Manifest, Progress, SnapshotMark};
+
 use crate::{
-    evaluation::{Exploring, TaskResult},
-    ledger::Terms,
     replay_log::{self, ReplayLogError, remedy},
-    tensorboard::Position,
     weights::Snapshot,
     weights_file::{self, WeightsFileError},
 };
 use rit_algo::Rit;
-use rit_config::RunDir;
+use rit_config::{Algorithm, RunDir};
 use rit_episode::{Episode, wire::Expected};
 use safetensors::{Dtype, SafeTensorError, SafeTensors, tensor::TensorView};
-use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 use std::{
     fs::{self, File},
@@ -44,17 +44,6 @@ pub const LATEST: &str = "latest";
 /// What a folder is called while it is written.
 const PARTIAL: &str = "partial";
 
-/// How far training has come.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Progress {
-    /// Environment steps collected.
-    pub env_steps: u64,
-    /// Episodes collected.
-    pub episodes: u64,
-    /// Updates made.
-    pub updates: u64,
-}
-
 /// All that training needs to go on, but for replay.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TrainingState {
@@ -70,45 +59,6 @@ pub struct TrainingState {
     pub snapshots: Vec<Snapshot>,
     /// The rest.
     pub manifest: Manifest,
-}
-
-/// The small part of a checkpoint, as it stands in `checkpoint.json`.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Manifest {
-    /// How far training has come. Optimiser steps are updates.
-    #[serde(flatten)]
-    pub progress: Progress,
-    /// Collected episodes when the target network was last copied.
-    pub target_copied_at: u64,
-    /// What the next batches are rolled with, in order.
-    pub terms: Vec<Terms>,
-    /// Versions and environment steps of the acting weights kept.
-    pub snapshots: Vec<SnapshotMark>,
-    /// (return, won) of exploring episodes of late, by task.
-    pub recent: Vec<Vec<(f64, bool)>>,
-    /// Exploring episodes on the whole, by task.
-    #[serde(default)]
-    pub exploring: Vec<Exploring>,
-    /// Length of `metrics.jsonl`, in bytes.
-    pub metrics_len: u64,
-    /// How far TensorBoard's event files go.
-    #[serde(default)]
-    pub tensorboard: Position,
-    /// Seconds the learner has run.
-    pub wall_s: f64,
-    /// The newest scheduled evaluation: task by task.
-    pub evaluation: Option<(Progress, Vec<(String, TaskResult)>)>,
-    /// Digest of the weights.
-    pub weights_digest: String,
-}
-
-/// Names one of the acting weights kept.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct SnapshotMark {
-    /// Updates that made them.
-    pub version: u64,
-    /// Environment steps collected by then.
-    pub env_steps: u64,
 }
 
 /// Why a checkpoint cannot be written or read.
@@ -256,8 +206,8 @@ pub struct Loaded {
     pub damaged: Vec<CheckpointError>,
 }
 
-/// The newest checkpoint that is whole, with replay's last `buffer_size` episodes; `None` where none was ever
-/// written.
+/// The newest checkpoint that is whole and of a run of this algorithm, with replay's last `buffer_size` episodes;
+/// `None` where none was ever written.
 ///
 /// # Errors
 /// When there are checkpoints and none can be used.
@@ -265,14 +215,14 @@ pub fn load_newest(
     run_dir: &RunDir,
     rit: &Rit,
     expected: &Expected,
-    buffer_size: usize,
+    algorithm: &Algorithm,
 ) -> Result<Option<Loaded>, CheckpointError> {
     let all = run_dir.checkpoints();
     let mut damaged = Vec::new();
     for folder in folders(&all)?.into_iter().rev() {
-        let loaded = load(&folder, rit).and_then(|state| {
+        let loaded = load(&folder, rit, expected.tasks.len(), algorithm).and_then(|state| {
             let end = state.manifest.progress.episodes;
-            let numbers = end.saturating_sub(buffer_size as u64)..end;
+            let numbers = end.saturating_sub(algorithm.buffer_size as u64)..end;
             let replay = replay_log::read(&run_dir.replay(), expected, numbers)?;
             Ok((state, replay))
         });
@@ -288,10 +238,12 @@ pub fn load_newest(
 }
 
 /// Reads one checkpoint's folder.
-///
-/// # Errors
-/// When anything in it is not what was written.
-pub fn load(folder: &Path, rit: &Rit) -> Result<TrainingState, CheckpointError> {
+fn load(
+    folder: &Path,
+    rit: &Rit,
+    tasks: usize,
+    algorithm: &Algorithm,
+) -> Result<TrainingState, CheckpointError> {
     let read = |name: &str| fs::read(folder.join(name)).map_err(io(&folder.join(name)));
     let sums = String::from_utf8_lossy(&read(SUMS)?).into_owned();
     let checked = |name: &str| {
@@ -307,6 +259,7 @@ pub fn load(folder: &Path, rit: &Rit) -> Result<TrainingState, CheckpointError> 
         |name: &str, what: String| CheckpointError::Inconsistent { path: folder.join(name), what };
     let manifest: Manifest = serde_json::from_slice(&checked(MANIFEST)?)
         .map_err(|error| inconsistent(MANIFEST, error.to_string()))?;
+    manifest.check(tasks, algorithm).map_err(|what| inconsistent(MANIFEST, what))?;
     checked(WEIGHTS)?;
     let params = weights_file::load(&folder.join(WEIGHTS), rit)?;
     let bytes = checked(STATE)?;

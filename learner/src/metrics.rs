@@ -20,7 +20,7 @@ use std::{
 use tokio::sync::watch;
 
 /// Episodes of each task that count as of late.
-const RECENT: usize = 100;
+pub const RECENT: usize = 100;
 
 /// Bytes that whoever follows the file reads at a time: far more than a line has.
 const CHUNK: u64 = 1 << 20;

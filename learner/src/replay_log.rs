@@ -170,7 +170,7 @@ impl ReplayLog {
             move |error| ReplayLogError::Io { path, error }
         };
         for first in files(&self.folder).map_err(io(&self.folder))? {
-            if first + FRAMES_PER_FILE <= number {
+            if first.saturating_add(FRAMES_PER_FILE) <= number {
                 let path = self.path(first);
                 fs::remove_file(&path).map_err(io(&path))?;
             }
@@ -238,14 +238,14 @@ fn path(folder: &Path, first: u64) -> PathBuf {
     folder.join(format!("{first:012}.frames"))
 }
 
-/// The first numbers of the files there are.
+/// The first numbers of the files there are. What is not called like one of ours is somebody else's.
 fn files(folder: &Path) -> io::Result<Vec<u64>> {
     let mut firsts = Vec::new();
     for entry in fs::read_dir(folder)? {
         let name = entry?.file_name();
         let first: Option<u64> =
             name.to_str().and_then(|name| name.strip_suffix(".frames")).and_then(|n| n.parse().ok());
-        firsts.extend(first);
+        firsts.extend(first.filter(|&first| path(folder, first).file_name() == Some(&*name)));
     }
     firsts.sort_unstable();
     Ok(firsts)
@@ -342,5 +342,20 @@ mod tests {
         let swapped = [&good[frame..2 * frame], &good[..frame], &good[2 * frame..]].concat();
         assert!(error(&swapped).contains("episode 1 lies where 0 should"));
         assert!(error(&good[..good.len() - 1]).contains("failed to fill whole buffer"));
+    }
+
+    #[test]
+    fn other_files_stay_where_they_are() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut log = log(folder.path(), 0);
+        episodes(0..2).iter().for_each(|episode| log.append(episode).unwrap());
+        let others = ["5.frames", "+00000000512.frames", "18446744073709551615.frames", "notes.frames"];
+        for name in others {
+            fs::write(folder.path().join(name), "").unwrap();
+        }
+        log.forget_before(512).unwrap();
+        let left: Vec<bool> = others.iter().map(|name| folder.path().join(name).exists()).collect();
+        assert_eq!(left, [true; 4]);
+        assert!(!folder.path().join("000000000000.frames").exists());
     }
 }

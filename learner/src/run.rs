@@ -15,7 +15,7 @@ use crate::{
     writer::Writer,
 };
 use rit_algo::{ConfigError, Rit};
-use rit_config::{Config, RunDir, Tls};
+use rit_config::{Algorithm, Config, RunDir, Tls};
 use rit_env::Split;
 use rit_episode::wire::{Expected, PayloadLayout};
 use rit_ipc::{CreateError, EpisodeReceiver, Limits, ReceiveError, RunSpace, RunSpaceError};
@@ -131,7 +131,7 @@ pub async fn run(
     let news = Box::new(move |what| {
         let _ = news.blocking_send(Event::News(what));
     });
-    let loaded = load(&run_dir, &rit, &expected, config.algorithm.buffer_size)?;
+    let loaded = load(&run_dir, &rit, &expected, &config.algorithm)?;
     let episodes = loaded.as_ref().map_or(0, |loaded| loaded.state.manifest.progress.episodes);
     let writer = Writer {
         run_dir: run_dir.clone(),
@@ -255,9 +255,9 @@ fn load(
     run_dir: &RunDir,
     rit: &Rit,
     expected: &Expected,
-    buffer_size: usize,
+    algorithm: &Algorithm,
 ) -> Result<Option<Loaded>, LearnerError> {
-    let loaded = checkpoint::load_newest(run_dir, rit, expected, buffer_size)?;
+    let loaded = checkpoint::load_newest(run_dir, rit, expected, algorithm)?;
     if let Some(Loaded { folder, state, damaged, .. }) = &loaded {
         for error in damaged {
             tracing::error!(%error, "a checkpoint is damaged; the one before is used");

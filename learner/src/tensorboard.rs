@@ -64,7 +64,7 @@ impl EventFile {
             }
             newest = newest.max(number);
         }
-        let name = format!("{PREFIX}{:010}", (wall_time() as u64).max(newest + 1));
+        let name = format!("{PREFIX}{:010}", (wall_time() as u64).max(newest.saturating_add(1)));
         let path = folder.join(&name);
         let file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&path)?;
         let mut events = Self { file: AppendFile::new(path, file, 0)?, name };

@@ -112,7 +112,8 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
 /// # Errors
 /// When there is no `=` or no key.
 pub fn set(assignment: &str) -> Result<Table, ConfigError> {
-    let source_name = || format!("--set {assignment}");
+    // Whatever a shell lets through, the message is one line.
+    let source_name = || format!("--set {}", assignment.replace(char::is_control, " "));
     let Some((key, value)) = assignment.split_once('=') else {
         let reason = "write --set section.key=value".to_owned();
         return Err(ConfigError::Syntax { source_name: source_name(), reason });
@@ -259,8 +260,14 @@ fn kind(value: &Value) -> &'static str {
     }
 }
 
+/// Longest key that is compared with the known ones: comparing takes time in proportion to the length.
+const COMPARED_LEN_MAX: usize = 100;
+
 /// The known key that looks most like this one, if any does.
 fn closest(key: &str) -> Option<String> {
+    if key.len() > COMPARED_LEN_MAX {
+        return None;
+    }
     let mut known = Vec::new();
     if let Ok(defaults) = parse(include_str!("presets/all.toml"), "presets/all.toml") {
         for (section, value) in &defaults {
@@ -347,6 +354,8 @@ mod tests {
         );
         assert_eq!(message(&["gamma=0.9"]), "unknown key \"gamma\"; did you mean \"algorithm.gamma\"?");
         assert_eq!(message(&["zzz.qqq=1"]), "unknown key \"zzz\"");
+        let endless = "gamma".repeat(1_000_000);
+        assert_eq!(message(&[&format!("{endless}=1")]), format!("unknown key \"{endless}\""));
         assert_eq!(
             message(&["algorithm.gamma=high"]),
             "algorithm.gamma must be a number, not a word in quotes"
@@ -374,5 +383,7 @@ mod tests {
             resolve("a = = b", "my.toml", &[]).unwrap_err().to_string().starts_with("my.toml is not TOML: ")
         );
         assert!(set("algorithm.gamma").unwrap_err().to_string().contains("section.key=value"));
+        let two_lines = set("seed\n8").unwrap_err().to_string();
+        assert_eq!(two_lines, "--set seed 8 is not TOML: write --set section.key=value");
     }
 }

@@ -1,21 +1,27 @@
 use super::*;
-use rit_episode::{RunSeed, Stream, wire::PayloadLayout};
+use crate::{evaluation::Exploring, ledger::Terms, tensorboard::Position};
+use rit_episode::{
+    RunSeed, Stream,
+    wire::{PayloadLayout, TaskSize},
+};
 
 struct Run {
     _folder: tempfile::TempDir,
     run_dir: RunDir,
     rit: Rit,
+    algorithm: Algorithm,
 }
 
 fn run() -> Run {
     let config = rit_config::resolve("environment.task_set = \"matrix-game\"", "test", &[]).unwrap();
     let folder = tempfile::tempdir().unwrap();
     let run_dir = RunDir::create(&folder.path().join("run"), &config).unwrap();
-    Run { _folder: folder, run_dir, rit: Rit::new(config.rit()).unwrap() }
+    let algorithm = Algorithm { buffer_size: 0, ..config.algorithm.clone() };
+    Run { _folder: folder, run_dir, rit: Rit::new(config.rit()).unwrap(), algorithm }
 }
 
 impl Run {
-    /// A state whose numbers tell which it is. It needs no replay.
+    /// A state whose numbers tell which it is. Its run has a replay of no episodes.
     fn state(&self, env_steps: u64) -> TrainingState {
         let numbers = |len: usize, index: u64| -> Vec<f32> {
             let layout = self.rit.layout.initial(&mut RunSeed(env_steps).stream(Stream::Weights, index));
@@ -29,9 +35,9 @@ impl Run {
             mean_square: numbers(params.len(), 3),
             snapshots: vec![Snapshot::new(4, 90, &acting), Snapshot::new(5, 100, &acting)],
             manifest: Manifest {
-                progress: Progress { env_steps, episodes: 0, updates: 5 },
+                progress: Progress { env_steps, episodes: 10, updates: 5 },
                 target_copied_at: 3,
-                terms: vec![Terms { weights_version: 4, epsilon: 0.1 + 0.2 }],
+                terms: [4, 5].map(|weights_version| Terms { weights_version, epsilon: 0.1 + 0.2 }).to_vec(),
                 snapshots: [(4, 90), (5, 100)]
                     .map(|(version, env_steps)| SnapshotMark { version, env_steps })
                     .to_vec(),
@@ -54,8 +60,9 @@ impl Run {
     fn load(&self) -> Result<Option<Loaded>, CheckpointError> {
         let dims = rit_env::TaskSet::MatrixGame.dims();
         let layout = PayloadLayout::new(dims);
-        let expected = Expected { run_id: self.run_dir.run_id(), layout, tasks: vec![] };
-        load_newest(&self.run_dir, &self.rit, &expected, 10)
+        let tasks = vec![TaskSize { n_agents: 2, n_entities: 2 }; 2];
+        let expected = Expected { run_id: self.run_dir.run_id(), layout, tasks };
+        load_newest(&self.run_dir, &self.rit, &expected, &self.algorithm)
     }
 }
 
@@ -69,7 +76,7 @@ fn a_state_comes_back_whole_and_latest_is_the_newest() {
     assert_eq!(loaded.state, run.state(100));
     assert!(loaded.damaged.is_empty());
     let latest = run.run_dir.checkpoints().join(LATEST);
-    assert_eq!(load(&latest, &run.rit).unwrap(), run.state(100));
+    assert_eq!(load(&latest, &run.rit, 2, &run.algorithm).unwrap(), run.state(100));
     run.save(100);
     assert_eq!(run.load().unwrap().unwrap().state, run.state(100), "once more by request");
 }
@@ -102,6 +109,23 @@ fn a_damaged_newest_is_reported_and_the_one_before_is_used() {
         fs::remove_file(&path).unwrap();
         assert!(run.load().unwrap().unwrap().damaged[0].to_string().contains("No such file"), "{name}");
     }
+}
+
+#[test]
+fn a_manifest_that_was_rewritten_with_its_sum_is_refused_for_what_it_says() {
+    let run = run();
+    run.save(10);
+    let newest = run.save(20);
+    let read = |name: &str| fs::read_to_string(newest.join(name)).unwrap();
+    let (manifest, sums) = (read(MANIFEST), read(SUMS));
+    let rewritten = manifest.replace("\"updates\": 5", "\"updates\": 11");
+    let sum = |text: &str| sha256(text.as_bytes());
+    fs::write(newest.join(MANIFEST), &rewritten).unwrap();
+    fs::write(newest.join(SUMS), sums.replace(&sum(&manifest), &sum(&rewritten))).unwrap();
+    let loaded = run.load().unwrap().unwrap();
+    assert_eq!(loaded.state, run.state(10));
+    let message = loaded.damaged[0].to_string();
+    assert!(message.ends_with("checkpoint.json: 11 updates are more than 10 batches"), "{message}");
 }
 
 #[test]
