@@ -3,6 +3,7 @@
 //! One task owns the ledger and the list of actors; everybody else sends it [`Event`]s. It never waits for
 //! the trainer or for an actor, so a slow one holds up nobody.
 
+mod control;
 mod status;
 
 use crate::{
@@ -10,7 +11,7 @@ use crate::{
     gauges::{Happenings, RateWindow, Stopwatch},
     ledger::{ActorId, Lease, Ledger, Reason, Terms},
     receive::Fence,
-    trainer::{Beginning, Checkpointed, News, Standing, Work},
+    trainer::{Beginning, News, Standing, Work},
     writer::CheckpointEnded,
 };
 use rit_config::Config;
@@ -18,11 +19,13 @@ use rit_episode::{Episode, wire};
 use rit_proto::v1::{self, LearnerMessage, learner_message::Message};
 use std::{
     collections::BTreeMap,
-    sync::{Arc, mpsc},
+    sync::mpsc,
     time::{Duration, Instant},
 };
 use tokio::sync::{mpsc as async_mpsc, oneshot};
 use tonic::Status;
+
+pub use control::Control;
 
 /// How long the end of a run waits for actors to go.
 const FAREWELL_TIMEOUT: Duration = Duration::from_secs(5);
@@ -64,28 +67,6 @@ pub enum Event {
     Over,
     /// Somebody asks or wants something.
     Control(Control),
-}
-
-/// What callers want, each with the way to answer.
-#[derive(Debug)]
-pub enum Control {
-    /// How the run stands.
-    Status(oneshot::Sender<v1::RunStatus>),
-    /// No further lease.
-    Pause(oneshot::Sender<v1::RunStatus>),
-    /// Leases again.
-    Resume(oneshot::Sender<v1::RunStatus>),
-    /// A checkpoint.
-    Checkpoint(oneshot::Sender<Checkpointed>),
-    /// The end of the run, with what is under way (`drain`) or without.
-    Stop {
-        /// Whether episodes under way are waited for.
-        drain: bool,
-        /// The way to answer.
-        answer: oneshot::Sender<v1::RunStatus>,
-    },
-    /// Other settings from now on.
-    Set(Arc<Config>, oneshot::Sender<v1::RunStatus>),
 }
 
 /// An actor that is there.
@@ -309,61 +290,6 @@ impl Coordinator {
         checkpoints.last_s = duration.as_secs_f64();
         checkpoints.total_s += checkpoints.last_s;
         self.happened(format!("wrote the checkpoint at {env_steps} steps in {} ms", duration.as_millis()));
-    }
-
-    fn control(&mut self, control: Control) {
-        // Whoever asked may have gone; the answers are then nobody's.
-        match control {
-            Control::Status(answer) => {
-                let _ = answer.send(self.status());
-            }
-            Control::Pause(answer) => {
-                if self.state == v1::RunState::Running {
-                    self.state = v1::RunState::Paused;
-                    tracing::info!("paused");
-                    self.happened("paused".into());
-                }
-                let _ = answer.send(self.status());
-            }
-            Control::Resume(answer) => {
-                if self.state == v1::RunState::Paused {
-                    self.state = v1::RunState::Running;
-                    tracing::info!("resumed");
-                    self.happened("resumed".into());
-                    self.hand_out();
-                }
-                let _ = answer.send(self.status());
-            }
-            Control::Checkpoint(answer) => {
-                let _ = self.work.send(Work::Checkpoint(answer));
-            }
-            Control::Stop { drain, answer } => {
-                tracing::info!(drain, "asked to stop");
-                self.happened("asked to stop".into());
-                self.state = v1::RunState::Stopping;
-                self.draining = drain;
-                if drain {
-                    self.stop_if_drained();
-                } else {
-                    let _ = self.work.send(Work::Stop);
-                }
-                let _ = answer.send(self.status());
-            }
-            Control::Set(config, answer) => {
-                self.config = Config::clone(&config);
-                let _ = self.work.send(Work::Set(config));
-                self.happened("settings changed".into());
-                let _ = answer.send(self.status());
-            }
-        }
-    }
-
-    /// Ends the run once nothing is under way any more; batches that are full are trained on first.
-    fn stop_if_drained(&mut self) {
-        if self.draining && self.ledger.counts().outstanding == 0 {
-            self.draining = false;
-            let _ = self.work.send(Work::Stop);
-        }
     }
 
     fn join(
