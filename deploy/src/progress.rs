@@ -34,6 +34,11 @@ impl Progress {
         Self { bar, plain: !quiet && !terminal, printed: None }
     }
 
+    /// Whether lines go to something that is no terminal.
+    pub fn is_plain(&self) -> bool {
+        self.plain
+    }
+
     /// Shows a newer status.
     pub fn update(&mut self, status: &RunStatus) {
         self.bar.set_position(status.env_steps);

@@ -259,7 +259,14 @@ impl Run<'_> {
     fn say_web_url(&mut self) {
         let url = self.run_dir.web_url();
         if let Some(url) = url.as_ref().filter(|_| url != self.web_url) {
-            self.progress.say(&format!("web page: {url}"));
+            // What is no terminal may be a log that others read: the token stays out of it.
+            let (page, _) = url.split_once("?token=").unwrap_or((url, ""));
+            let root = self.run_dir.root().display();
+            self.progress.say(&if self.progress.is_plain() {
+                format!("web page: {page} (`rit ctl --run {root} web` says the address that lets you in)")
+            } else {
+                format!("web page: {url}")
+            });
         }
         self.web_url = url;
     }
