@@ -62,20 +62,23 @@ pub fn run(options: &BenchOptions) -> Result<ExitCode, Failure> {
 
 /// Rows of one kind, a line each.
 fn table(rows: &[Value]) -> String {
-    let objects: Vec<&Map<String, Value>> = rows.iter().filter_map(Value::as_object).collect();
-    let Some(first) = objects.first() else { return String::new() };
-    let mut text: String = first.keys().map(|key| format!("  {key}")).collect();
-    for object in objects {
-        text += "\n";
-        for (key, value) in object {
-            let width = key.len() + 2;
-            text += &match value.as_f64().filter(|_| value.is_f64()) {
-                Some(number) => format!("{number:>width$.2}"),
-                None => format!("{:>width$}", value.to_string().trim_matches('"')),
-            };
-        }
-    }
-    text
+    let Some(first) = rows.first().and_then(Value::as_object) else { return String::new() };
+    let cell = |value: &Value| match value {
+        Value::Number(number) if number.is_f64() => format!("{:.2}", number.as_f64().unwrap_or_default()),
+        Value::String(text) => text.clone(),
+        value => value.to_string(),
+    };
+    let columns: Vec<Vec<String>> = first
+        .keys()
+        .map(|key| {
+            let cells: Vec<String> =
+                [key.clone()].into_iter().chain(rows.iter().map(|row| cell(&row[key]))).collect();
+            let width = cells.iter().map(String::len).max().unwrap_or(0) + 2;
+            cells.iter().map(|cell| format!("{cell:>width$}")).collect()
+        })
+        .collect();
+    let line = |row: usize| columns.iter().map(|column| column[row].as_str()).collect::<String>();
+    (0..=rows.len()).map(line).collect::<Vec<_>>().join("\n")
 }
 
 /// What a benchmark prints, in this order.
