@@ -2,6 +2,7 @@
 
 use crate::{
     cli::{ConfigOptions, TrainOptions},
+    control,
     experiments::{self, Experiment},
     failure::{Failure, INTERRUPTED},
     logging::LogOptions,
@@ -12,7 +13,7 @@ use crate::{
 use rit_config::{Config, RunDir};
 use rit_ipc::RunSpace;
 use rit_proto::{
-    transport::{self, Client, Credentials},
+    transport::Client,
     v1::{RunStatus, StatusRequest, StopRequest, TaskResult, control_client::ControlClient},
 };
 use std::{
@@ -231,14 +232,14 @@ impl Run<'_> {
     async fn control(&mut self, learner: &mut Process) -> Result<ControlClient<Client>, Failure> {
         let listening = async {
             loop {
-                if let Ok(address) = fs::read_to_string(self.run_dir.address()) {
-                    return address;
+                if self.run_dir.address().exists() {
+                    return;
                 }
                 tokio::time::sleep(START_POLL).await;
             }
         };
-        let address = tokio::select! {
-            address = listening => address.trim().parse().map_err(Failure::runtime)?,
+        tokio::select! {
+            () = listening => {}
             status = learner.wait() => return Err(died(learner, status.map_err(Failure::runtime)?)),
             () = tokio::time::sleep(START_TIMEOUT) => {
                 learner.end().await;
@@ -249,10 +250,9 @@ impl Run<'_> {
                     learner.log().display()
                 )));
             }
-        };
+        }
         self.say_web_url();
-        let credentials = Credentials::token(self.run_dir.token());
-        Ok(ControlClient::new(transport::connect(&address, &credentials).await?))
+        control::connect(self.run_dir).await
     }
 
     /// Says where the web page is, when it is there first and when it moves.

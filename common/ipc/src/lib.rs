@@ -9,10 +9,10 @@
 //!   is behind. Nothing is overwritten and nothing is dropped silently.
 //!
 //! ```no_run
-//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! # use rit_episode::wire::Frame;
 //! # use rit_ipc::{EpisodeReceiver, EpisodeSender, Limits, RunSpace};
-//! # use std::time::Duration;
-//! # let (payload_len, frame, stopping): (_, rit_episode::wire::Frame, fn() -> bool) = unimplemented!();
+//! # use std::{error::Error, time::Duration};
+//! # fn run(payload_len: usize, frame: Frame, stopping: fn() -> bool) -> Result<(), Box<dyn Error>> {
 //! // Every process of the run.
 //! let space = RunSpace::new("/tmp/rit-1000/1a2b3c4d".as_ref())?;
 //!

@@ -383,28 +383,39 @@ mod tests {
         }
     }
 
+    /// Gradients of queries, keys and parameters. The first two are written over, whatever lay there.
+    fn backward(
+        attention: &Attention,
+        params: &[f32],
+        xq: &[f32],
+        xk: &[f32],
+        state: &mut AttentionState,
+        d_out: &[f32],
+    ) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
+        let (mut dxq, mut dxk, mut grads) =
+            (vec![9.0; xq.len()], vec![9.0; xk.len()], vec![0.0; params.len()]);
+        attention.backward(
+            params,
+            View::dense(xq, INPUTS),
+            View::dense(xk, INPUTS),
+            &groups(),
+            state,
+            View::dense(d_out, DIM),
+            ViewMut::dense(&mut dxq, INPUTS),
+            ViewMut::dense(&mut dxk, INPUTS),
+            &mut grads,
+            &mut Scratch::default(),
+        );
+        (dxq, dxk, grads)
+    }
+
     #[test]
     fn who_sees_nothing_gets_exactly_zero_and_passes_no_gradient() {
         let (attention, len) = unit(2);
         let (params, xq, xk) = (noise(1, len), noise(2, 3 * INPUTS), noise(3, 5 * INPUTS));
         let (out, mut state) = run(&attention, &params, &xq, &xk, Visible::Where(&SEEN));
         assert_eq!(out[2 * DIM..], [0.0; DIM]);
-        let (mut dxq, mut dxk, mut grads) = (vec![9.0; xq.len()], vec![9.0; xk.len()], vec![0.0; len]);
-        let d_out = noise(4, 3 * DIM);
-        let views = (View::dense(&xq, INPUTS), View::dense(&xk, INPUTS), View::dense(&d_out, DIM));
-        let (to_q, to_k) = (ViewMut::dense(&mut dxq, INPUTS), ViewMut::dense(&mut dxk, INPUTS));
-        attention.backward(
-            &params,
-            views.0,
-            views.1,
-            &groups(),
-            &mut state,
-            views.2,
-            to_q,
-            to_k,
-            &mut grads,
-            &mut Scratch::default(),
-        );
+        let (dxq, dxk, _) = backward(&attention, &params, &xq, &xk, &mut state, &noise(4, 3 * DIM));
         assert_eq!(dxq[2 * INPUTS..], [0.0; INPUTS]);
         assert_eq!(dxk[3 * INPUTS..], [0.0; 2 * INPUTS]);
     }
@@ -420,22 +431,7 @@ mod tests {
                 out.iter().zip(&to).map(|(out, to)| f64::from(out * to)).sum()
             };
             let (_, mut state) = run(&attention, &params, &xq, &xk, visible);
-            let (mut dxq, mut dxk, mut grads) = (vec![0.0; xq.len()], vec![0.0; xk.len()], vec![0.0; len]);
-            let views = (View::dense(&xq, INPUTS), View::dense(&xk, INPUTS), View::dense(&to, DIM));
-            let (to_q, to_k) = (ViewMut::dense(&mut dxq, INPUTS), ViewMut::dense(&mut dxk, INPUTS));
-            let scratch = &mut Scratch::default();
-            attention.backward(
-                &params,
-                views.0,
-                views.1,
-                &groups(),
-                &mut state,
-                views.2,
-                to_q,
-                to_k,
-                &mut grads,
-                scratch,
-            );
+            let (dxq, dxk, grads) = backward(&attention, &params, &xq, &xk, &mut state, &to);
             check("params", &params, &grads, |params| loss(params, &xq, &xk));
             check("queries", &xq, &dxq, |xq| loss(&params, xq, &xk));
             check("keys", &xk, &dxk, |xk| loss(&params, &xq, xk));

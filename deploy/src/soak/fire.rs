@@ -19,8 +19,8 @@ use tokio::process::{Child, Command};
 /// From one look at the run to the next.
 const LOOK_EVERY: Duration = Duration::from_millis(5);
 
-/// A successor that does not come within this time does not come.
-const RESTART_TIMEOUT: Duration = Duration::from_secs(60);
+/// A successor that does not come within this time does not come; a run that stands for so long is stuck.
+const PATIENCE: Duration = Duration::from_secs(60);
 
 /// Attempts to meet a checkpoint while it is written.
 const CHECKPOINTS_TRIED: usize = 50;
@@ -77,6 +77,15 @@ pub struct Kill {
     pub restart_s: f64,
 }
 
+/// What is waited for.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Wait {
+    /// A moment of the run, however far off, as long as it goes on.
+    Progress,
+    /// The successor of what was killed.
+    Successor,
+}
+
 /// A `rit train` under way.
 #[derive(Debug)]
 pub struct Run {
@@ -131,7 +140,7 @@ impl Run {
         for index in 0..kills {
             // The last tenth is left in peace, else a kill might come after the end.
             let moment = (index as f64 + rng.random::<f64>()) / kills as f64 * 0.9 * env_steps as f64;
-            let status = self.wait_for(|status| status.env_steps as f64 >= moment).await?;
+            let status = self.wait_for(Wait::Progress, |status| status.env_steps as f64 >= moment).await?;
             let drawn = Victim::draw(rng);
             let victim = if self.killed < KILLS_PER_SUPERVISOR { drawn } else { Victim::Everything };
             let actor = rng.random_range(0..status.actors.len().max(1));
@@ -154,7 +163,7 @@ impl Run {
             Victim::Actor | Victim::StoppedActor => {
                 let (name, pid) = (status.actors[actor].name.clone(), status.actors[actor].pid);
                 signal(pid, if victim == Victim::Actor { Signal::KILL } else { Signal::STOP })?;
-                self.wait_for(|status| {
+                self.wait_for(Wait::Successor, |status| {
                     status.actors.iter().any(|actor| actor.name == name && actor.pid != pid)
                 })
                 .await?;
@@ -165,7 +174,10 @@ impl Run {
                     begun = Instant::now();
                 }
                 signal(learner, Signal::KILL)?;
-                self.wait_for(|status| status.pid != learner && status.actors.len() >= actors).await?;
+                self.wait_for(Wait::Successor, |status| {
+                    status.pid != learner && status.actors.len() >= actors
+                })
+                .await?;
             }
             Victim::Everything => {
                 // The supervisor first, else it would begin to put things right.
@@ -176,7 +188,10 @@ impl Run {
                 self.train.wait().await.map_err(Failure::runtime)?;
                 self.train = train(&["--resume".to_owned(), self.root.display().to_string()], &self.root)?;
                 self.killed = 0;
-                self.wait_for(|status| status.pid != learner && status.actors.len() >= actors).await?;
+                self.wait_for(Wait::Successor, |status| {
+                    status.pid != learner && status.actors.len() >= actors
+                })
+                .await?;
             }
         }
         Ok(Kill { victim, restart_s: begun.elapsed().as_secs_f64() })
@@ -205,8 +220,12 @@ impl Run {
     }
 
     /// Looks at the run until it is as wanted.
-    async fn wait_for(&mut self, wanted: impl Fn(&RunStatus) -> bool) -> Result<RunStatus, Failure> {
-        let begun = Instant::now();
+    async fn wait_for(
+        &mut self,
+        what: Wait,
+        wanted: impl Fn(&RunStatus) -> bool,
+    ) -> Result<RunStatus, Failure> {
+        let (mut since, mut env_steps) = (Instant::now(), 0);
         let mut control = None;
         loop {
             if self.train.try_wait().map_err(Failure::runtime)?.is_some() {
@@ -227,14 +246,18 @@ impl Run {
                         if wanted(&status) {
                             return Ok(status);
                         }
-                        if begun.elapsed() > RESTART_TIMEOUT && status.env_steps == 0 {
-                            return Err(Failure::runtime_message("the run does not begin"));
+                        if what == Wait::Progress && status.env_steps > env_steps {
+                            (since, env_steps) = (Instant::now(), status.env_steps);
                         }
                     }
                     Err(_) => control = None,
                 }
-            } else if begun.elapsed() > RESTART_TIMEOUT {
-                return Err(Failure::runtime_message("the learner does not come back"));
+            }
+            if since.elapsed() > PATIENCE {
+                return Err(Failure::runtime_message(match what {
+                    Wait::Progress => "the run stands still",
+                    Wait::Successor => "what was killed does not come back",
+                }));
             }
             tokio::time::sleep(LOOK_EVERY).await;
         }
