@@ -245,6 +245,7 @@ mod tests {
             available: vec![],
             actions: vec![],
             rewards: vec![],
+            shaping: vec![],
             end: End::Terminated,
             won: false,
         }

@@ -63,6 +63,7 @@ mod tests {
             available: vec![],
             actions: vec![],
             rewards: vec![],
+            shaping: vec![],
             end: End::Terminated,
             won: false,
         }

@@ -15,7 +15,7 @@ pub struct Step {
     pub episode: usize,
     /// Decision step, 0 to T; T is the bootstrap state, where nothing is decided.
     pub time: usize,
-    /// Team reward; 0 in the bootstrap state.
+    /// What the step pays in training, team reward and shaping; 0 in the bootstrap state.
     pub reward: f32,
     /// Whether the step was taken: false in the bootstrap state.
     pub filled: bool,
@@ -184,7 +184,7 @@ impl Rows {
         let (n, m, steps) = (episode.n_agents, episode.n_entities, episode.steps());
         let filled = time < steps;
         let terminated = time + 1 == steps && episode.end == End::Terminated;
-        let reward = if filled { episode.rewards[time] } else { 0.0 };
+        let reward = if filled { episode.rewards[time] + episode.shaping[time] } else { 0.0 };
         let step = Step { episode: index, time, reward, filled, terminated, task: episode.task };
         let d = episode.entities.len() / ((steps + 1) * m);
         let n_actions = episode.available.len() / ((steps + 1) * n);
@@ -236,6 +236,7 @@ mod tests {
             available: vec![1; (steps + 1) * n * 2],
             actions: (0..steps * n).map(|row| (row % 2) as u8).collect(),
             rewards: (0..steps).map(|time| time as f32 + 1.0).collect(),
+            shaping: vec![0.25; steps],
             end,
             won: false,
         }
@@ -252,10 +253,11 @@ mod tests {
         let whose: Vec<_> = rows.steps.iter().map(|step| (step.episode, step.time)).collect();
         assert_eq!(whose, [(1, 0), (0, 0), (1, 1), (0, 1), (1, 2)]);
         let facts: Vec<_> = rows.steps.iter().map(|s| (s.filled, s.terminated, s.reward)).collect();
+        // What training adds is part of what a step pays, but not of what the task encoder is shown.
         let expected = [
-            (true, false, 1.0),
-            (true, false, 1.0),
-            (true, true, 2.0),
+            (true, false, 1.25),
+            (true, false, 1.25),
+            (true, true, 2.25),
             (false, false, 0.0),
             (false, false, 0.0),
         ];

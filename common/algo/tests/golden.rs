@@ -264,6 +264,7 @@ impl Cells {
             available: vec![],
             actions: vec![],
             rewards: rewards[index * self.steps_max..][..steps].to_vec(),
+            shaping: vec![0.0; steps],
             end: if terminated[index * self.steps_max + steps - 1] == 1.0 {
                 End::Terminated
             } else {

@@ -52,6 +52,7 @@ fn episode(task: usize, n: usize, m: usize, steps: usize, end: End, rng: &mut Rn
         available,
         actions,
         rewards: (0..steps).map(|_| rng.random_range(-1.0..1.0)).collect(),
+        shaping: vec![0.0; steps],
         end,
         won: false,
     }

@@ -32,6 +32,7 @@ pub struct Config {
 pub struct Environment {
     pub task_set: TaskSet,
     pub view_radius: f32,
+    pub approach_shaping: f32,
 }
 
 /// `[algorithm]`.
@@ -297,8 +298,8 @@ impl Config {
 
     /// How the environments differ from what their task says.
     pub fn environment_options(&self) -> EnvironmentOptions {
-        let radius = self.environment.view_radius;
-        EnvironmentOptions { view_radius: radius.is_finite().then_some(radius) }
+        let Environment { view_radius, approach_shaping, .. } = self.environment;
+        EnvironmentOptions { view_radius: view_radius.is_finite().then_some(view_radius), approach_shaping }
     }
 
     /// ε after so many collected environment steps.
@@ -317,6 +318,7 @@ impl Config {
         const SIZE: f64 = 4096.0;
         vec![
             ("environment.view_radius", self.environment.view_radius.into(), 0.0, f64::INFINITY),
+            ("environment.approach_shaping", self.environment.approach_shaping.into(), 0.0, 1e3),
             ("algorithm.gamma", algorithm.gamma.into(), 0.0, 1.0),
             ("algorithm.lr", algorithm.lr.into(), 1e-12, 1.0),
             ("algorithm.rmsprop_alpha", algorithm.rmsprop_alpha.into(), 0.0, 1.0),

@@ -46,6 +46,14 @@ pub enum ConfigError {
         /// Its largest.
         max: f64,
     },
+    /// A number that changes nothing in this task set.
+    #[error("{key} means nothing to {task_set}; leave it out")]
+    Meaningless {
+        /// The key.
+        key: &'static str,
+        /// The task set.
+        task_set: TaskSet,
+    },
     /// A word that means nothing there.
     #[error("{0}")]
     Name(#[from] UnknownName),
@@ -102,6 +110,10 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
         if !(min..=max).contains(&value) {
             return Err(ConfigError::Range { key, value, min, max });
         }
+    }
+    let task_set = config.environment.task_set;
+    if config.environment.approach_shaping != 0.0 && !task_set.has_prey() {
+        return Err(ConfigError::Meaningless { key: "environment.approach_shaping", task_set });
     }
     config.rit().validate()?;
     Ok(config)
@@ -367,6 +379,10 @@ mod tests {
         assert_eq!(
             message(&["algorithm.batch_size=6000"]),
             "algorithm.batch_size = 6000 is out of range 1..=5000"
+        );
+        assert_eq!(
+            message(&["environment.approach_shaping=5"]),
+            "environment.approach_shaping means nothing to matrix-game; leave it out"
         );
         assert_eq!(message(&["network.n_heads=3"]), "attention_dim 64 is not a multiple of n_heads 3");
         assert!(message(&["training.until=win_rate=2"]).contains("write win_rate=NUMBER"));

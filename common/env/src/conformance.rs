@@ -57,7 +57,7 @@ fn roll(environment: &mut dyn Environment, episode: u64) -> Vec<(Observation, Op
         let actions: Vec<Action> =
             (0..n).map(|agent| any_available(&observation, agent, exploration)).collect();
         let step = environment.step(&actions, rng);
-        assert!(step.reward.is_finite(), "rewards are finite");
+        assert!(step.reward.is_finite() && step.shaping.is_finite(), "rewards are finite");
         course.push((observation, Some(step)));
     }
 }

@@ -8,6 +8,8 @@ use serde::{Deserialize, Serialize};
 pub struct Step {
     /// Team reward.
     pub reward: f32,
+    /// What training adds to it by [`EnvironmentOptions`]; no return counts it. 0 for most.
+    pub shaping: f32,
     /// Set on the last step of the episode.
     pub end: Option<End>,
     /// Whether the team has won; only meaningful where the task knows winning.
@@ -20,6 +22,9 @@ pub struct Step {
 pub struct EnvironmentOptions {
     /// How far an agent sees in a particle world, from centre to centre; everything where `None`.
     pub view_radius: Option<f32>,
+    /// Predator and prey: [`Step::shaping`] is this · what a step takes off Σ_predators distance to the nearest
+    /// prey.
+    pub approach_shaping: f32,
 }
 
 /// What a body is to the agents.

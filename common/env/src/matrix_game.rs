@@ -72,10 +72,10 @@ impl Environment for MatrixGame {
     fn step(&mut self, actions: &[Action], _: &mut Rng) -> Step {
         self.step += 1;
         if self.step == 1 {
-            return Step { reward: FIRST_REWARD[self.game], end: None, won: false };
+            return Step { reward: FIRST_REWARD[self.game], shaping: 0.0, end: None, won: false };
         }
         let won = actions == OPTIMAL[self.game];
-        Step { reward: if won { WIN } else { MISS }, end: Some(End::Terminated), won }
+        Step { reward: if won { WIN } else { MISS }, shaping: 0.0, end: Some(End::Terminated), won }
     }
 }
 
@@ -109,11 +109,11 @@ mod tests {
                     let [one, two] = [[first / 3, first % 3], [second / 3, second % 3]];
                     let step = environment.step(&one, rng);
                     let expected = table[usize::from(one[0])][usize::from(one[1])].0;
-                    assert_eq!(step, Step { reward: expected, end: None, won: false });
+                    assert_eq!(step, Step { reward: expected, shaping: 0.0, end: None, won: false });
                     let step = environment.step(&two, rng);
                     let expected = table[usize::from(two[0])][usize::from(two[1])].1;
                     let won = expected == 100.0;
-                    assert_eq!(step, Step { reward: expected, end: Some(End::Terminated), won });
+                    assert_eq!(step, Step { reward: expected, shaping: 0.0, end: Some(End::Terminated), won });
                 }
             }
         }

@@ -155,7 +155,7 @@ impl Running {
     fn step(&mut self) -> Option<(End, bool)> {
         let step = self.world.step(&self.actions, &mut self.environment_rng);
         self.world.observe(&mut self.observation);
-        self.builder.step(&self.actions, step.reward, &self.observation);
+        self.builder.step(&self.actions, step.reward, step.shaping, &self.observation);
         self.previous_reward = step.reward;
         step.end.map(|end| (end, step.won))
     }
@@ -255,7 +255,7 @@ mod tests {
     fn options_reach_the_environments() {
         for (view_radius, sees_others) in [(None, true), (Some(0.0), false)] {
             let tasks = TaskSet::CooperativeNavigation.tasks(Split::Training);
-            let options = EnvironmentOptions { view_radius };
+            let options = EnvironmentOptions { view_radius, ..EnvironmentOptions::default() };
             let episodes = Rollout::new(tasks, options, RunSeed(1), true)
                 .roll(&mut Fixed([0, 0]), &[Job { task: Some(0), ..jobs(0..1)[0] }]);
             let rows = episodes[0].observable.chunks_exact(4).enumerate();

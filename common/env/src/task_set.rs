@@ -98,6 +98,14 @@ impl TaskSet {
         }
     }
 
+    /// Whether anybody flees in its tasks.
+    pub fn has_prey(self) -> bool {
+        match self {
+            Self::PredatorPrey | Self::PredatorPreyPro => true,
+            Self::MatrixGame | Self::CooperativeNavigation => false,
+        }
+    }
+
     /// The padded sizes over all its tasks, testing tasks included (paper, appendix A).
     pub fn dims(self) -> Dims {
         let tasks = [Split::Training, Split::Testing].into_iter().flat_map(|split| self.tasks(split));
@@ -197,7 +205,7 @@ mod tests {
             for task in all_tasks(set) {
                 conformance::check(|| task.environment(EnvironmentOptions::default()));
             }
-            let short_sighted = EnvironmentOptions { view_radius: Some(0.5) };
+            let short_sighted = EnvironmentOptions { view_radius: Some(0.5), approach_shaping: 0.5 };
             conformance::check(|| set.tasks(Split::Training)[0].environment(short_sighted));
         }
     }

@@ -37,6 +37,8 @@ pub struct Episode {
     pub actions: Vec<Action>,
     /// Team rewards, `[T]`.
     pub rewards: Vec<f32>,
+    /// What training adds to them, `[T]`: of the targets alone, not of returns or representations.
+    pub shaping: Vec<f32>,
     /// Why it ended.
     pub end: End,
     /// Whether the environment calls it won.
@@ -56,7 +58,7 @@ impl Episode {
 
     /// Bytes its own data takes.
     pub fn bytes(&self) -> usize {
-        4 * (self.entities.len() + self.rewards.len())
+        4 * (self.entities.len() + self.rewards.len() + self.shaping.len())
             + self.observable.len()
             + self.available.len()
             + self.actions.len()
@@ -92,6 +94,7 @@ impl EpisodeBuilder {
                 available: Vec::new(),
                 actions: Vec::new(),
                 rewards: Vec::new(),
+                shaping: Vec::new(),
                 end: End::Truncated,
                 won: false,
             },
@@ -100,11 +103,12 @@ impl EpisodeBuilder {
         builder
     }
 
-    /// Records a joint action, what it earned and the state it led to.
-    pub fn step(&mut self, actions: &[Action], reward: f32, next: &Observation) {
+    /// Records a joint action, what it earned, what training adds, and the state it led to.
+    pub fn step(&mut self, actions: &[Action], reward: f32, shaping: f32, next: &Observation) {
         debug_assert_eq!(actions.len(), self.episode.n_agents);
         self.episode.actions.extend_from_slice(actions);
         self.episode.rewards.push(reward);
+        self.episode.shaping.push(shaping);
         self.observe(next);
     }
 

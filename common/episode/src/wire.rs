@@ -7,6 +7,7 @@
 //! |---|---|---|
 //! | entities | f32 | `[T + 1, m, d]`: agents in decision order, padded agents up to `n`, non-agents, padding |
 //! | rewards | f32 | `[T]` |
+//! | shaping | f32 | `[T]` |
 //! | observable | u8 | `[T + 1, n, m]` |
 //! | available | u8 | `[T + 1, n, A]` |
 //! | actions | u8 | `[T, n]` |
@@ -25,7 +26,7 @@ use bytemuck::{Pod, Zeroable};
 pub const MAGIC: [u8; 8] = *b"RITEPSD\0";
 
 /// Changes whenever header or payload change their meaning.
-pub const LAYOUT_VERSION: u32 = 1;
+pub const LAYOUT_VERSION: u32 = 2;
 
 /// Alignment of header and payload, in bytes.
 pub const ALIGNMENT: usize = 8;
@@ -104,6 +105,7 @@ const _: () = assert!(size_of::<Header>().is_multiple_of(ALIGNMENT));
 pub struct PayloadLayout {
     dims: Dims,
     rewards: usize,
+    shaping: usize,
     observable: usize,
     available: usize,
     actions: usize,
@@ -117,12 +119,13 @@ impl PayloadLayout {
         let Dims { entity_dim, n_actions, agents_max, entities_max, steps_max } = dims;
         let rows = steps_max + 1;
         let rewards = 4 * rows * entities_max * entity_dim;
-        let observable = rewards + 4 * steps_max;
+        let shaping = rewards + 4 * steps_max;
+        let observable = shaping + 4 * steps_max;
         let available = observable + rows * agents_max * entities_max;
         let actions = available + rows * agents_max * n_actions;
         let decision_order = actions + steps_max * agents_max;
         let len = (decision_order + agents_max).next_multiple_of(ALIGNMENT);
-        Self { dims, rewards, observable, available, actions, decision_order, len }
+        Self { dims, rewards, shaping, observable, available, actions, decision_order, len }
     }
 
     /// Bytes of a payload.
@@ -197,6 +200,7 @@ pub fn encode(
         && episode.observable.len() == (steps + 1) * n * m
         && episode.available.len() == (steps + 1) * n * n_actions
         && episode.actions.len() == steps * n
+        && episode.shaping.len() == steps
         && episode.decision_order.len() == n;
     if !fits {
         return Err(EncodeError { n_agents: n, n_entities: m, steps, dims: layout.dims });
@@ -222,6 +226,7 @@ pub fn encode(
         }
     }
     payload[layout.rewards..][..4 * steps].copy_from_slice(bytemuck::cast_slice(&episode.rewards));
+    payload[layout.shaping..][..4 * steps].copy_from_slice(bytemuck::cast_slice(&episode.shaping));
     for time in 0..steps {
         payload[layout.actions + time * agents_max..][..n].copy_from_slice(&episode.actions[time * n..][..n]);
     }
@@ -296,15 +301,16 @@ pub fn decode(header: &Header, payload: &[u8], expected: &Expected) -> Result<Ep
             available.extend_from_slice(&allowed[..n_actions]);
         }
     }
-    let mut rewards = Vec::with_capacity(steps);
+    let (mut rewards, mut shaping) = (Vec::with_capacity(steps), Vec::with_capacity(steps));
     extend_f32(&mut rewards, &payload[layout.rewards..layout.rewards + 4 * steps]);
+    extend_f32(&mut shaping, &payload[layout.shaping..layout.shaping + 4 * steps]);
     let mut actions = Vec::with_capacity(steps * n);
     for time in 0..steps {
         actions.extend_from_slice(&payload[layout.actions + time * agents_max..][..n]);
     }
     let decision_order = payload[layout.decision_order..][..n].to_vec();
 
-    for (section, numbers) in [("entities", &entities), ("rewards", &rewards)] {
+    for (section, numbers) in [("entities", &entities), ("rewards", &rewards), ("shaping", &shaping)] {
         if !numbers.iter().fold(true, |finite, number| finite & number.is_finite()) {
             return Err(Rejection::NotFinite { section });
         }
@@ -336,6 +342,7 @@ pub fn decode(header: &Header, payload: &[u8], expected: &Expected) -> Result<Ep
         available,
         actions,
         rewards,
+        shaping,
         end: if header.end == 1 { End::Terminated } else { End::Truncated },
         won: header.won == 1,
     })

@@ -102,6 +102,7 @@ pub mod tests {
             available: Vec::new(),
             actions: vec![2, 1, 0, 4],
             rewards: vec![-1.5, 0.25],
+            shaping: vec![0.0; 2],
             end: End::Terminated,
             won: false,
         };

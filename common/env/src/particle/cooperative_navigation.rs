@@ -77,7 +77,7 @@ impl Environment for CooperativeNavigation {
     fn step(&mut self, actions: &[Action], _: &mut Rng) -> Step {
         self.world.set_forces(actions);
         let end = self.world.advance();
-        Step { reward: self.team_reward(), end, won: false }
+        Step { reward: self.team_reward(), shaping: 0.0, end, won: false }
     }
 
     fn scene(&self) -> Option<Scene> {

@@ -51,6 +51,7 @@ pub enum PredatorPreyReward {
 pub struct PredatorPrey {
     world: World,
     reward: PredatorPreyReward,
+    approach_shaping: f32,
 }
 
 impl PredatorPrey {
@@ -66,7 +67,8 @@ impl PredatorPrey {
     ) -> Self {
         assert!(prey >= 1, "there is something to hunt");
         let bodies = [vec![PREDATOR; predators], vec![OBSTACLE; OBSTACLES], vec![PREY; prey]].concat();
-        Self { world: World::new(bodies, predators, options), reward }
+        let approach_shaping = options.approach_shaping;
+        Self { world: World::new(bodies, predators, options), reward, approach_shaping }
     }
 
     fn predators(&self) -> &[Body] {
@@ -93,14 +95,18 @@ impl PredatorPrey {
         match self.reward {
             PredatorPreyReward::Plain => catch,
             PredatorPreyReward::Pro => {
-                let distance = |predator: &Body| {
-                    let places = prey.iter().map(|prey| prey.position);
-                    squared_distance_to_nearest(predator.position, places).sqrt()
-                };
-                let distances: f32 = predators.iter().map(distance).sum();
-                catch + DISTANCE_REWARD * predators.len() as f32 * distances
+                catch + DISTANCE_REWARD * predators.len() as f32 * self.distances_to_prey()
             }
         }
+    }
+
+    /// Σ_predators distance to the nearest prey.
+    fn distances_to_prey(&self) -> f32 {
+        let distance = |predator: &Body| {
+            let places = self.prey().iter().map(|prey| prey.position);
+            squared_distance_to_nearest(predator.position, places).sqrt()
+        };
+        self.predators().iter().map(distance).sum()
     }
 }
 
@@ -143,8 +149,10 @@ impl Environment for PredatorPrey {
             let prey = &mut self.world.bodies[index];
             prey.force = scaled(offset, prey.acceleration);
         }
+        let distances = (self.approach_shaping != 0.0).then(|| self.distances_to_prey());
         let end = self.world.advance();
-        Step { reward: self.team_reward(), end, won: false }
+        let nearer = distances.map_or(0.0, |before| before - self.distances_to_prey());
+        Step { reward: self.team_reward(), shaping: self.approach_shaping * nearer, end, won: false }
     }
 
     fn scene(&self) -> Option<Scene> {

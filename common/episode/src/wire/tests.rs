@@ -33,7 +33,8 @@ fn episode(task: usize, steps: usize, seed: u64) -> Episode {
     let mut builder = EpisodeBuilder::new(seed, seed / 2, task, order, &observe(rng));
     for _ in 0..steps {
         let actions: Vec<u8> = (0..n_agents).map(|_| rng.random_range(0..DIMS.n_actions) as u8).collect();
-        builder.step(&actions, rng.random_range(-1.0..1.0), &observe(rng));
+        let (reward, shaping) = (rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0));
+        builder.step(&actions, reward, shaping, &observe(rng));
     }
     builder
         .finish(if seed.is_multiple_of(2) { End::Terminated } else { End::Truncated }, seed.is_multiple_of(3))
@@ -117,9 +118,9 @@ fn an_encoder_refuses_what_does_not_fit() {
 fn each_fault_has_its_name() {
     let layout = PayloadLayout::new(DIMS);
     let reason = |result: Result<Episode, Rejection>| result.map_err(|rejection| rejection.reason());
-    let cases: [(&str, Result<Episode, Rejection>); 17] = [
+    let cases: [(&str, Result<Episode, Rejection>); 18] = [
         ("magic", altered(|header, _| header.magic[0] = b'X')),
-        ("layout_version", altered(|header, _| header.layout_version = 2)),
+        ("layout_version", altered(|header, _| header.layout_version += 1)),
         ("run", altered(|header, _| header.run_id[3] ^= 1)),
         ("dims", altered(|header, _| header.entities_max = 8)),
         ("length", altered(|header, _| header.payload_len -= 8)),
@@ -134,6 +135,10 @@ fn each_fault_has_its_name() {
         ("decision_order", altered(|_, payload| payload[layout.decision_order] = 2)),
         ("action", altered(|_, payload| payload[layout.actions] = 3)),
         ("not_finite", altered(|_, payload| payload[..4].copy_from_slice(&f32::NAN.to_le_bytes()))),
+        (
+            "not_finite",
+            altered(|_, payload| payload[layout.shaping..][..4].copy_from_slice(&f32::NAN.to_le_bytes())),
+        ),
         (
             "action",
             altered(|_, payload| {

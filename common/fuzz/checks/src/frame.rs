@@ -106,6 +106,7 @@ fn padded_episode(task: usize, TaskSize { n_agents, n_entities }: TaskSize) -> E
         available: vec![1; (steps + 1) * n_agents * 3],
         actions: (0..steps * n_agents).map(|i| (i % 3) as u8).collect(),
         rewards: (0..steps).map(|i| -(i as f32)).collect(),
+        shaping: vec![0.5; steps],
         end: if task.is_multiple_of(2) { rit_episode::End::Terminated } else { rit_episode::End::Truncated },
         won: task == 1,
     }

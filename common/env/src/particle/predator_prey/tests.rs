@@ -50,6 +50,25 @@ fn pays_catches_and_in_the_pro_series_distance() {
 }
 
 #[test]
+fn shaping_pays_what_a_step_takes_off_the_distances_and_touches_no_reward() {
+    let (predators, prey) = ([[-3.0, 0.0], [0.0, 4.0]], [[0.0, 0.0]]);
+    let steps = [0.0, 2.0].map(|approach_shaping| {
+        let options = EnvironmentOptions { approach_shaping, ..EnvironmentOptions::default() };
+        let mut environment = PredatorPrey::new(2, 1, Pro, options);
+        environment.world.place(&[&predators[..], &OBSTACLES_AT, &prey].concat());
+        // The first goes right, towards the prey; the second stays.
+        let step = environment.step(&[2, 0], &mut stream(7));
+        (step, environment.prey()[0].position)
+    });
+    let [(plain, at), (shaped, _)] = steps;
+    // Velocity first, then position: 0.1 · 3, and a tenth of that.
+    let distances = (-2.97 - at[0]).hypot(at[1]) + at[0].hypot(4.0 - at[1]);
+    assert!((shaped.shaping - 2.0 * (7.0 - distances)).abs() < 1e-5, "{shaped:?}");
+    assert!((plain.reward + 0.2 * distances).abs() < 1e-5, "{plain:?}");
+    assert_eq!(plain, Step { shaping: 0.0, ..shaped });
+}
+
+#[test]
 fn prey_flee_to_the_free_candidate_farthest_from_the_nearest_predator() {
     // The same rule by the book: all candidates, then those that are free, then the farthest.
     for episode in 0..200 {
