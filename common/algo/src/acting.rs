@@ -1,8 +1,10 @@
 //! The networks choosing joint actions, one row after another, for several running episodes at once.
 
 use crate::{
-    Before, Networks, Rit, Rows,
+    Rit, Rows,
     decoder::{Decoder, DecoderState, Seen, Tables, best},
+    task_encoder::TaskEncoderState,
+    utility::UtilityState,
 };
 use rit_episode::{Policy, Turn};
 use rit_nn::{Scratch, View, vectorized};
@@ -16,7 +18,8 @@ pub struct Acting {
     /// The recurrent states of each slot's running episode.
     memories: Vec<Memory>,
     rows: Rows,
-    networks: Networks,
+    task_encoder: TaskEncoderState,
+    utility: UtilityState,
     scratch: Scratch,
     before: Memory,
 }
@@ -39,7 +42,8 @@ impl Acting {
             tables: Tables::default(),
             memories: Vec::new(),
             rows: Rows::default(),
-            networks: Networks::default(),
+            task_encoder: TaskEncoderState::default(),
+            utility: UtilityState::default(),
             scratch: Scratch::default(),
             before: Memory::default(),
         };
@@ -61,12 +65,12 @@ impl Acting {
     /// The utilities of the last [`Policy::act`], turn after turn, `[agent rows, A]`: each row's Q given the
     /// actions that were chosen before it.
     pub fn utilities(&self) -> &[f32] {
-        &self.networks.utility.decoder.utilities
+        &self.utility.decoder.utilities
     }
 
     /// The task representations of the last [`Policy::act`], turn after turn, `[agent rows, h_z]`.
     pub fn task_representations(&self) -> &[f32] {
-        &self.networks.task_encoder.representation
+        &self.task_encoder.representation
     }
 }
 
@@ -85,7 +89,7 @@ impl Policy for Acting {
 
     fn act(&mut self, turns: &mut [Turn<'_>]) {
         let h = self.rit.config.hidden_dim;
-        let Self { rit, params, tables, memories, rows, networks, scratch, before } = self;
+        let Self { rit, params, tables, memories, rows, task_encoder, utility, scratch, before } = self;
         rows.fill_from_turns(turns);
         before.utility.clear();
         before.task_encoder.clear();
@@ -93,21 +97,21 @@ impl Policy for Acting {
             before.utility.extend_from_slice(&memories[turn.slot].utility);
             before.task_encoder.extend_from_slice(&memories[turn.slot].task_encoder);
         }
-        let before = Before {
-            utility: Some(View::dense(&before.utility, h)),
-            task_encoder: Some(View::dense(&before.task_encoder, h)),
-        };
-        rit.prepare(params, tables, rows, before, networks, scratch);
+        let of_task_encoder = Some(View::dense(&before.task_encoder, h));
+        rit.represent(params, rows, of_task_encoder, task_encoder, scratch);
+        let z = rit.representation(&task_encoder.representation);
+        let before = Some(View::dense(&before.utility, h));
+        rit.utility.forward(params, tables, rows, before, z, utility, scratch);
         for (group, turn) in rows.groups.iter().zip(turns.iter()) {
             let states = group.queries.start * h..group.queries.end * h;
             let memory = &mut memories[turn.slot];
-            memory.utility.copy_from_slice(&networks.utility.history()[states.clone()]);
+            memory.utility.copy_from_slice(&utility.history()[states.clone()]);
             if rit.task_encoder.is_some() {
-                memory.task_encoder.copy_from_slice(&networks.task_encoder.history()[states]);
+                memory.task_encoder.copy_from_slice(&task_encoder.history()[states]);
             }
         }
 
-        choose(&rit.utility.decoder, params, tables, rows, &mut networks.utility.decoder, turns);
+        choose(&rit.utility.decoder, params, tables, rows, &mut utility.decoder, turns);
     }
 }
 

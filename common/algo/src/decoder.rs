@@ -358,9 +358,7 @@ impl Decoder {
         let mut d_scores = scratch.take(rows * width);
         let to = ViewMut::dense(&mut d_scores, width);
         matmul::x_wt(d_hidden_view, View::dense(&tables.contexts, h), to, Accum::Replace);
-        for (d_weights, weights) in d_scores.chunks_exact_mut(k).zip(state.weights.chunks_exact(k)) {
-            softmax_backward(weights, d_weights);
-        }
+        softmax_backward(&state.weights, &mut d_scores, k);
         let d_scores_view = View::dense(&d_scores, width);
         matmul::dyt_x(d_scores_view, history, ViewMut::dense(&mut d.scores, h), Accum::Add);
         linear::add_column_sums(d_scores_view, &mut d.score_bias);
@@ -463,11 +461,14 @@ fn counted_softmax(scores: &[f32], bias: &[f32], counts: &[f32], weights: &mut [
     weights.iter_mut().for_each(|weight| *weight /= total);
 }
 
-/// d_score = w (d_w − Σ w d_w), in place.
-#[inline(always)]
-fn softmax_backward(weights: &[f32], d_weights: &mut [f32]) {
-    let mean: f32 = weights.iter().zip(&*d_weights).map(|(w, d)| w * d).sum();
-    for (d, w) in d_weights.iter_mut().zip(weights) {
-        *d = w * (*d - mean);
+vectorized! {
+    /// d_score = w (d_w − Σ w d_w) in place, for every k weights that are one softmax.
+    fn softmax_backward<'a>(weights: &'a [f32], d_weights: &'a mut [f32], k: usize) {
+        for (d_weights, weights) in d_weights.chunks_exact_mut(k).zip(weights.chunks_exact(k)) {
+            let mean: f32 = weights.iter().zip(&*d_weights).map(|(w, d)| w * d).sum();
+            for (d, w) in d_weights.iter_mut().zip(weights) {
+                *d = w * (*d - mean);
+            }
+        }
     }
 }

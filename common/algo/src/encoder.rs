@@ -95,7 +95,7 @@ impl Encoder {
             View::dense(&state.encoded, width).columns(0..h),
             View::dense(&state.x, h),
             &rows.groups,
-            &mut state.attention,
+            &state.attention,
             d_attended,
             ViewMut::dense(&mut d_queries, h),
             ViewMut::dense(&mut d_x, h),

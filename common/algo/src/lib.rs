@@ -20,6 +20,6 @@ mod update;
 pub mod utility;
 
 pub use acting::Acting;
-pub use rit::{Before, ConfigError, Mixing, Networks, Rit, RitConfig, TaskRepresentations};
+pub use rit::{ConfigError, Mixing, Networks, Rit, RitConfig, TaskRepresentations};
 pub use rows::{Rows, Step, TerminalStates};
-pub use update::{Losses, Update, UpdateConfig};
+pub use update::{Losses, Seen, Update, UpdateConfig};

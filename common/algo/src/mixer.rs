@@ -36,7 +36,7 @@ pub struct Mixer {
 /// embedding size:
 #[derive(Debug, Default)]
 pub struct MixerState {
-    encoder: EncoderState,
+    pub(crate) encoder: EncoderState,
     /// c, `[R, h + h_z]`.
     context: Vec<f32>,
     /// ReLU'd w1_hidden, w2_hidden, b2_hidden, and b1, `[R, 2y + 2x]`.
@@ -85,15 +85,8 @@ impl Mixer {
         (0..y, y..y + x, y + x..y + 2 * x)
     }
 
-    /// Fills `state.q_total` (G) from each agent's chosen utility `q` (R) and `representation` (R, h_z).
-    pub fn forward(
-        &self,
-        params: &[f32],
-        rows: &Rows,
-        q: &[f32],
-        representation: View<'_>,
-        state: &mut MixerState,
-    ) {
+    /// All that does not depend on utilities: the weights that mix them, from `representation` (R, h_z).
+    pub fn prepare(&self, params: &[f32], rows: &Rows, representation: View<'_>, state: &mut MixerState) {
         let (h, x, y) = (self.out.outputs, self.mixing_dim(), self.w1.inputs);
         let (agents, groups) = (rows.agent_rows(), rows.groups.len());
         self.encoder.forward(params, rows, Visible::All, &mut state.encoder);
@@ -115,13 +108,20 @@ impl Mixer {
         let mean_width = y + 2 * x;
         let means = fit(&mut state.means, groups * mean_width);
         average(&rows.groups, View::dense(&state.hyper, outputs).columns(y..outputs), means);
-        let (w2_hidden, b2_hidden, b1) = self.mean_columns();
+        let (w2_hidden, b2_hidden, _) = self.mean_columns();
         let means = View::dense(means, mean_width);
         self.w2.forward(params, means.columns(w2_hidden), ViewMut::dense(fit(&mut state.w2, groups * x), x));
         self.b2.forward(params, means.columns(b2_hidden), ViewMut::dense(fit(&mut state.b2, groups), 1));
-        let MixerState { w1, w2, b2, hidden, q_total, .. } = state;
+    }
+
+    /// Fills `state.q_total` (G) from each agent's chosen utility `q` (R), after [`Mixer::prepare`].
+    pub fn forward(&self, rows: &Rows, q: &[f32], state: &mut MixerState) {
+        let (groups, x, y) = (rows.groups.len(), self.mixing_dim(), self.w1.inputs);
+        let (_, _, b1) = self.mean_columns();
+        let MixerState { w1, w2, b2, means, hidden, q_total, .. } = state;
         let (hidden, q_total) = (fit(hidden, groups * x), fit(q_total, groups));
-        mix(&rows.groups, q, [w1, w2, b2], means.columns(b1), hidden, q_total);
+        let b1 = View::dense(means, y + 2 * x).columns(b1);
+        mix(&rows.groups, q, [w1, w2, b2], b1, hidden, q_total);
     }
 
     /// Takes `d_total` (G). Writes `d_q` (R), adds to `d_representation` (R, h_z) and to the parameters'

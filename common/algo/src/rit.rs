@@ -161,24 +161,38 @@ impl Rit {
         0..self.target_len
     }
 
-    /// From rows to prepared decisions: z, then τ and all of the decoder that needs no predecessors.
+    /// From rows to task representations z, left in `state`. `before` (rows of the first time, h) is the task
+    /// encoder's recurrent state before the first time, or zeros.
+    pub fn represent(
+        &self,
+        params: &[f32],
+        rows: &Rows,
+        before: Option<View<'_>>,
+        state: &mut TaskEncoderState,
+        scratch: &mut Scratch,
+    ) {
+        if let Some(task_encoder) = &self.task_encoder {
+            task_encoder.forward(params, rows, before, state, scratch);
+        }
+    }
+
+    /// All of the networks that needs no actions. `representation` is z (R, h_z).
     pub fn prepare(
         &self,
         params: &[f32],
         tables: &Tables,
         rows: &Rows,
-        before: Before<'_>,
+        representation: View<'_>,
         state: &mut Networks,
         scratch: &mut Scratch,
     ) {
-        if let Some(task_encoder) = &self.task_encoder {
-            task_encoder.forward(params, rows, before.task_encoder, &mut state.task_encoder, scratch);
+        self.utility.forward(params, tables, rows, None, representation, &mut state.utility, scratch);
+        if let Some(mixer) = &self.mixer {
+            mixer.prepare(params, rows, representation, &mut state.mixer);
         }
-        let z = self.representation(&state.task_encoder);
-        self.utility.forward(params, tables, rows, before.utility, z, &mut state.utility, scratch);
     }
 
-    /// From prepared decisions to Q_total (groups) of these actions (agent rows), left in `state.q_total`.
+    /// From what was prepared to Q_total (groups) of these actions (agent rows), left in `state.q_total`.
     pub fn value(&self, params: &[f32], tables: &Tables, rows: &Rows, actions: &[u8], state: &mut Networks) {
         let decoder = &mut state.utility.decoder;
         self.utility.decoder.forward(params, tables, rows, actions, decoder);
@@ -189,8 +203,7 @@ impl Rit {
             .extend(utilities.zip(actions).map(|(utilities, &action)| utilities[usize::from(action)]));
         state.q_total.clear();
         if let Some(mixer) = &self.mixer {
-            let z = self.representation(&state.task_encoder);
-            mixer.forward(params, rows, &state.chosen, z, &mut state.mixer);
+            mixer.forward(rows, &state.chosen, &mut state.mixer);
             state.q_total.extend_from_slice(&state.mixer.q_total);
         } else {
             let sums =
@@ -200,28 +213,17 @@ impl Rit {
     }
 
     /// z (R, h_z); of no columns without task representations.
-    pub fn representation<'a>(&self, state: &'a TaskEncoderState) -> View<'a> {
+    pub fn representation<'a>(&self, data: &'a [f32]) -> View<'a> {
         match self.config.representation_dim() {
             0 => View { data: &[], rows: 0, cols: 0, stride: 0 },
-            dim => View::dense(&state.representation, dim),
+            dim => View::dense(data, dim),
         }
     }
 }
 
-/// The recurrent states before the first time, (rows of the first time, h) each; zeros where `None`.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Before<'a> {
-    /// The utility network's τ.
-    pub utility: Option<View<'a>>,
-    /// The task encoder's.
-    pub task_encoder: Option<View<'a>>,
-}
-
-/// What one set of weights made of one set of rows.
+/// What one set of weights made of one set of rows and their task representations.
 #[derive(Debug, Default)]
 pub struct Networks {
-    /// The task encoder's part, with z.
-    pub task_encoder: TaskEncoderState,
     /// The utility network's part, with τ and Q.
     pub utility: UtilityState,
     /// The mixer's part.

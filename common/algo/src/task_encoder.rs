@@ -31,10 +31,10 @@ pub struct TaskEncoder {
 /// What forward leaves for backward.
 #[derive(Debug, Default)]
 pub struct TaskEncoderState {
-    encoder: EncoderState,
+    pub(crate) encoder: EncoderState,
     /// ReLU'd reward embeddings, `[groups, r]`: the reward is the team's, so it is embedded once per group.
     rewards: Vec<f32>,
-    gru: GruState,
+    pub(crate) gru: GruState,
     /// z, `[R, h_z]`.
     pub representation: Vec<f32>,
 }

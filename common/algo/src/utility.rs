@@ -21,8 +21,8 @@ pub struct Utility {
 /// What forward leaves for backward.
 #[derive(Debug, Default)]
 pub struct UtilityState {
-    encoder: EncoderState,
-    gru: GruState,
+    pub(crate) encoder: EncoderState,
+    pub(crate) gru: GruState,
     /// The decoder's part, with the utilities.
     pub decoder: DecoderState,
 }

@@ -4,15 +4,18 @@
 //! case's own `case.json`. The references were computed in float64 and stored as f32.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "helpers of tests are tests too")]
 
-use rit_algo::{Losses, Mixing, Rit, RitConfig, TaskRepresentations, TerminalStates, Update, UpdateConfig};
+use rit_algo::{
+    Losses, Mixing, Rit, RitConfig, Seen, TaskRepresentations, TerminalStates, Update, UpdateConfig,
+};
 use rit_episode::{End, Episode, decision_order};
 use rit_nn::{Optimizer, OptimizerKind, optimizer};
 use safetensors::SafeTensors;
 use serde::Deserialize;
 use std::{
+    collections::HashMap,
     fs,
     path::{Path, PathBuf},
-    sync::Arc,
+    sync::{Arc, Mutex},
 };
 
 #[derive(Deserialize)]
@@ -124,15 +127,22 @@ fn compare(folder: &Path, shards: usize, terminal_states: TerminalStates, report
     let episodes: Vec<Episode> =
         (0..cells.episodes()).map(|index| cells.episode(&batch, sizes, index)).collect();
     let pairing: Vec<usize> = batch.i32("pairing").iter().map(|&row| row as usize).collect();
-    let losses = update.gradients(&episodes.iter().collect::<Vec<_>>(), |rows| {
-        assert_eq!(rows, pairing.len(), "one pair for each filled agent row");
-        pairing
-    });
+    let said = Mutex::new(HashMap::new());
+    let losses = update.gradients_seen(
+        &episodes.iter().collect::<Vec<_>>(),
+        |rows| {
+            assert_eq!(rows, pairing.len(), "one pair for each filled agent row");
+            pairing
+        },
+        |states| {
+            said.lock().unwrap().extend(states.map(|seen| ((seen.episode, seen.time), Said::new(&seen))));
+        },
+    );
 
     compare_losses(&losses, &case.scalars, report);
     // What training leaves out cannot be compared one by one: losses and gradients show that it does not count.
     if terminal_states == TerminalStates::Kept {
-        compare_networks(&update, &cells, sizes, &expected, report);
+        compare_networks(&said.into_inner().unwrap(), &cells, sizes, &expected, report);
     }
     for param in rit.layout.params() {
         let name = format!("gradient of {}", param.name);
@@ -141,7 +151,7 @@ fn compare(folder: &Path, shards: usize, terminal_states: TerminalStates, report
 
     // The optimiser, fed with the stored gradients.
     let stored = flat(&rit, &gradients, 0..rit.layout.len());
-    let scale = optimizer::clip_scale(optimizer::norm(&stored), case.grad_norm_clip);
+    let scale = optimizer::clip_scale(optimizer::sum_of_squares(&stored).sqrt(), case.grad_norm_clip);
     let mut stepped = weights;
     Optimizer::new(kind, lr, stepped.len()).step(&mut stepped, &stored, scale);
     let after = read("weights_after_step");
@@ -163,8 +173,39 @@ fn compare_losses(losses: &Losses, scalars: &Scalars, report: &mut Report) {
     }
 }
 
-/// Compares what is filled and real.
-fn compare_networks(update: &Update, cells: &Cells, sizes: &Sizes, expected: &Tensors, report: &mut Report) {
+/// What the networks said in one state.
+struct Said {
+    history: Vec<f32>,
+    task_representation: Vec<f32>,
+    utilities: Vec<f32>,
+    greedy_actions: Vec<u8>,
+    q_total: f32,
+    target_q_total: f32,
+    td_target: f32,
+}
+
+impl Said {
+    fn new(seen: &Seen<'_>) -> Self {
+        Self {
+            history: seen.history.to_vec(),
+            task_representation: seen.task_representation.to_vec(),
+            utilities: seen.utilities.to_vec(),
+            greedy_actions: seen.greedy_actions.to_vec(),
+            q_total: seen.q_total,
+            target_q_total: seen.target_q_total,
+            td_target: seen.td_target,
+        }
+    }
+}
+
+/// Compares what is filled and real. `said` by (episode, time).
+fn compare_networks(
+    said: &HashMap<(usize, usize), Said>,
+    cells: &Cells,
+    sizes: &Sizes,
+    expected: &Tensors,
+    report: &mut Report,
+) {
     let (h, z, a) = (sizes.hidden_dim, sizes.task_representation_dim, sizes.n_actions);
     let mut tensors: [(&str, Vec<f32>, Vec<f32>); 7] = [
         "history",
@@ -179,8 +220,7 @@ fn compare_networks(update: &Update, cells: &Cells, sizes: &Sizes, expected: &Te
     let greedy = expected.i32("greedy_actions");
     for (episode, &steps) in cells.steps.iter().enumerate() {
         for time in 0..steps {
-            let at = |time| update.inspect(cells.episodes(), episode, time);
-            let (now, next) = (at(time), at(time + 1));
+            let (now, next) = (&said[&(episode, time)], &said[&(episode, time + 1)]);
             let cell = episode * cells.steps_max + time;
             let state = episode * (cells.steps_max + 1) + time;
             for (k, &row) in cells.agents[episode].iter().enumerate() {
@@ -190,13 +230,13 @@ fn compare_networks(update: &Update, cells: &Cells, sizes: &Sizes, expected: &Te
                     all.extend_from_slice(&ours[k * width..][..width]);
                     reference.extend_from_slice(&theirs[(cell * sizes.agents_max + row) * width..][..width]);
                 };
-                compare(0, now.history(), state, h);
-                compare(1, now.task_representation(), state, z);
-                compare(2, now.utilities(), cell, a);
-                tensors[6].1.push(f32::from(next.greedy_actions()[k]));
+                compare(0, &now.history, state, h);
+                compare(1, &now.task_representation, state, z);
+                compare(2, &now.utilities, cell, a);
+                tensors[6].1.push(f32::from(next.greedy_actions[k]));
                 tensors[6].2.push(greedy[cell * sizes.agents_max + row] as f32);
             }
-            for (tensor, ours) in [(3, now.q_total()), (4, next.target_q_total()), (5, now.td_target())] {
+            for (tensor, ours) in [(3, now.q_total), (4, next.target_q_total), (5, now.td_target)] {
                 tensors[tensor].1.push(ours);
                 let theirs = expected.f32(tensors[tensor].0)[cell];
                 tensors[tensor].2.push(theirs);

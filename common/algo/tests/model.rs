@@ -4,14 +4,17 @@
 
 use rand::RngExt as _;
 use rit_algo::{
-    Acting, Mixing, Rit, RitConfig, TaskRepresentations, TerminalStates, Update, UpdateConfig,
+    Acting, Mixing, Rit, RitConfig, Seen, TaskRepresentations, TerminalStates, Update, UpdateConfig,
     contrastive::draw_pairing,
 };
 use rit_episode::{
     End, Episode, Exploration, Observation, Policy, Rng, RunSeed, Stream, Turn, decision_order,
 };
 use rit_nn::{OptimizerKind, gradcheck};
-use std::sync::Arc;
+use std::{
+    collections::HashMap,
+    sync::{Arc, Mutex},
+};
 
 const D: usize = 5;
 const A: usize = 3;
@@ -190,12 +193,18 @@ fn acting_row_by_row_equals_the_masked_parallel_pass() {
         let episodes = batch(11);
         let batch: Vec<&Episode> = episodes.iter().collect();
         let mut update = update(&rit, 1, 1, at.clone());
-        update.gradients(&batch, |rows| (0..rows).collect());
+        let trained = Mutex::new(HashMap::new());
+        let see = |states: &mut dyn Iterator<Item = Seen<'_>>| {
+            let utilities = states.map(|seen| ((seen.episode, seen.time), seen.utilities.to_vec()));
+            trained.lock().unwrap().extend(utilities);
+        };
+        update.gradients_seen(&batch, |rows| (0..rows).collect(), see);
+        let trained = trained.into_inner().unwrap();
         let mut acting = Acting::new(Arc::clone(&rit), &at[rit.acting()]);
         let slots: Vec<_> = batch.iter().copied().enumerate().collect();
         for ((index, episode), acted) in slots.iter().zip(replay(&mut acting, &slots)) {
             for time in 0..episode.steps() {
-                let trained = update.inspect(batch.len(), *index, time).utilities();
+                let trained = &trained[&(*index, time)];
                 let acted = &acted[time * episode.n_agents * A..][..episode.n_agents * A];
                 for (a, b) in acted.iter().zip(trained) {
                     assert!((a - b).abs() <= 1e-5 * b.abs().max(1.0), "episode {index} step {time}: {a} {b}");
@@ -215,6 +224,28 @@ fn acting_does_not_depend_on_company() {
     for (index, episode) in episodes.iter().enumerate() {
         let alone = replay(&mut Acting::new(Arc::clone(&rit), &at[rit.acting()]), &[(3, episode)]);
         assert_eq!(alone[0], all[index], "episode {index}, bit for bit");
+    }
+}
+
+/// A batch need not fill every shard, nor fill them evenly.
+#[test]
+fn shards_without_episodes_add_nothing() {
+    let rit = Arc::new(Rit::new(config(1, true, true)).unwrap());
+    let episodes = batch(17);
+    let batch: Vec<&Episode> = episodes.iter().collect();
+    let grads = |shards| {
+        let mut update = update(&rit, shards, 2, params(&rit, 4));
+        let losses = update.gradients(&batch, |rows| (0..rows).rev().collect());
+        (losses, update.grads().to_vec())
+    };
+    let (losses, five) = grads(5);
+    // Eight shards of one episode at most; four, of two at most.
+    for shards in [8, 4] {
+        let (other, grads) = grads(shards);
+        assert!((losses.td_loss - other.td_loss).abs() < 1e-6, "{losses:?} {other:?}");
+        for (a, b) in grads.iter().zip(&five) {
+            assert!((a - b).abs() < 1e-4 * b.abs().max(1.0), "{shards} shards: {a} {b}");
+        }
     }
 }
 

@@ -113,7 +113,10 @@ mod tests {
                     let step = environment.step(&two, rng);
                     let expected = table[usize::from(two[0])][usize::from(two[1])].1;
                     let won = expected == 100.0;
-                    assert_eq!(step, Step { reward: expected, shaping: 0.0, end: Some(End::Terminated), won });
+                    assert_eq!(
+                        step,
+                        Step { reward: expected, shaping: 0.0, end: Some(End::Terminated), won }
+                    );
                 }
             }
         }

@@ -4,7 +4,9 @@
 //! sees nothing gets zeros, exactly, and passes no gradient.
 
 use crate::{
-    LayoutBuilder, Linear, Scratch, View, ViewMut, activation, fit, linear, math, matmul, vectorized,
+    LayoutBuilder, Linear, Scratch, View, ViewMut, fit, for_lanes, linear,
+    math::{self, LANES, Lanes, each, load, store},
+    matmul, vectorized,
 };
 use faer::Accum;
 use std::ops::Range;
@@ -51,12 +53,11 @@ pub enum Visible<'a> {
 /// What forward leaves for backward. With Q query rows and K key rows:
 #[derive(Debug, Default)]
 pub struct AttentionState {
-    /// `[Q, a]`; backward leaves its gradient here.
+    /// `[Q, a]`.
     queries: Vec<f32>,
     /// Keys and ReLU'd values, `[K, 2a]`.
     key_values: Vec<f32>,
-    /// Softmax weights; the groups' `[heads, queries, keys]` one after another. Backward leaves the scores'
-    /// gradient here.
+    /// Softmax weights; the groups' `[heads, queries, keys]` one after another.
     weights: Vec<f32>,
 }
 
@@ -87,30 +88,19 @@ impl Attention {
         groups: &[Group],
         visible: Visible<'_>,
         state: &mut AttentionState,
-        mut out: ViewMut<'_>,
+        out: ViewMut<'_>,
     ) {
         let AttentionState { queries, key_values, weights } = state;
         let pairs: usize = groups.iter().map(Group::pairs).sum();
         let weights = fit(weights, pairs * self.heads);
-        let head_dim = self.head_dim();
-        soften(View::dense(queries, self.dim), key_values, groups, visible, weights, self.scale(), head_dim);
-        let mut weights = &*weights;
-        for group in groups {
-            for head in 0..self.heads {
-                let (_, values) = self.head_of(key_values, group, head);
-                let (front, rest) = weights.split_at(group.pairs());
-                let weights_of = View::dense(front, group.keys.len());
-                let columns = head * head_dim..(head + 1) * head_dim;
-                let to = out.reborrow().rows(group.queries.clone()).columns(columns);
-                matmul::dy_w(weights_of, values, to, Accum::Replace);
-                weights = rest;
-            }
-        }
+        let queries = View::dense(queries, self.dim);
+        score(queries, key_values, groups, visible, weights, self.head_dim());
+        exponentiate(weights);
+        blend(key_values, groups, weights, out, self.head_dim());
     }
 
     /// Takes `d_out` (Q, a). Writes `dx_queries` (Q, h) and `dx_keys` (K, h) and adds to the parameters'
-    /// gradients. With w the weights: d_value = wᵀ d_out, d_w = d_out valueᵀ, d_score = w (d_w − Σ w d_w),
-    /// d_query = d_score key and d_key = d_scoreᵀ query.
+    /// gradients.
     #[allow(clippy::too_many_arguments, reason = "a matrix and its companions, each named")]
     pub fn backward(
         &self,
@@ -118,60 +108,19 @@ impl Attention {
         x_queries: View<'_>,
         x_keys: View<'_>,
         groups: &[Group],
-        state: &mut AttentionState,
+        state: &AttentionState,
         d_out: View<'_>,
         dx_queries: ViewMut<'_>,
         dx_keys: ViewMut<'_>,
         grads: &mut [f32],
         scratch: &mut Scratch,
     ) {
-        let (a, head_dim) = (self.dim, self.head_dim());
+        let a = self.dim;
         let AttentionState { queries, key_values, weights } = state;
-        // Every key belongs to one group, so all of this is written.
-        let mut d_key_values = scratch.take(key_values.len());
-        let both = |head: usize| {
-            (head * head_dim..(head + 1) * head_dim, a + head * head_dim..a + (head + 1) * head_dim)
-        };
-        let mut rest = &weights[..];
-        for group in groups {
-            for head in 0..self.heads {
-                let (front, behind) = rest.split_at(group.pairs());
-                let (columns, values) = both(head);
-                let d_out = d_out.rows(group.queries.clone()).columns(columns);
-                let d_values =
-                    ViewMut::dense(&mut d_key_values, 2 * a).rows(group.keys.clone()).columns(values);
-                matmul::dyt_x(View::dense(front, group.keys.len()), d_out, d_values, Accum::Replace);
-                rest = behind;
-            }
-        }
-        soften_backward(
-            d_out,
-            View::dense(key_values, 2 * a).columns(a..2 * a),
-            groups,
-            weights,
-            self.scale(),
-            head_dim,
-        );
-        let mut d_queries = scratch.take(queries.len());
-        let mut rest = &weights[..];
-        for group in groups {
-            for head in 0..self.heads {
-                let (front, behind) = rest.split_at(group.pairs());
-                let d_scores = View::dense(front, group.keys.len());
-                let (columns, _) = both(head);
-                let (keys, _) = self.head_of(key_values, group, head);
-                let of_queries = group.queries.clone();
-                let d_q = ViewMut::dense(&mut d_queries, a).rows(of_queries.clone()).columns(columns.clone());
-                matmul::dy_w(d_scores, keys, d_q, Accum::Replace);
-                let q = View::dense(queries, a).rows(of_queries).columns(columns.clone());
-                let d_keys =
-                    ViewMut::dense(&mut d_key_values, 2 * a).rows(group.keys.clone()).columns(columns);
-                matmul::dyt_x(d_scores, q, d_keys, Accum::Replace);
-                rest = behind;
-            }
-        }
-        let values = View::dense(key_values, 2 * a).columns(a..2 * a);
-        activation::relu_backward(values, ViewMut::dense(&mut d_key_values, 2 * a).columns(a..2 * a));
+        // Every query and every key belongs to one group, so all of these are written.
+        let (mut d_queries, mut d_key_values) = (scratch.take(queries.len()), scratch.take(key_values.len()));
+        let d = (&mut d_queries[..], &mut d_key_values[..]);
+        attend_backward(d_out, View::dense(queries, a), key_values, groups, weights, d, self.head_dim());
         self.query.backward(params, x_queries, View::dense(&d_queries, a), Some(dx_queries), grads);
         let d_key_values_view = View::dense(&d_key_values, 2 * a);
         linear::add_column_sums(
@@ -184,62 +133,46 @@ impl Attention {
         scratch.give(d_queries);
     }
 
-    /// One head's keys and values of one group, (keys, head dim) each.
-    fn head_of<'a>(&self, key_values: &'a [f32], group: &Group, head: usize) -> (View<'a>, View<'a>) {
-        let (a, head_dim) = (self.dim, self.head_dim());
-        let rows = View::dense(key_values, 2 * a).rows(group.keys.clone());
-        let first = head * head_dim;
-        (rows.columns(first..first + head_dim), rows.columns(a + first..a + first + head_dim))
-    }
-
     /// Size of one head.
     fn head_dim(&self) -> usize {
         self.dim / self.heads
     }
+}
 
-    /// 1/√(a / heads).
-    fn scale(&self) -> f32 {
-        1.0 / (self.head_dim() as f32).sqrt()
-    }
+/// What a score is scaled with: 1/√(a / heads).
+#[inline(always)]
+fn scale(head_dim: usize) -> f32 {
+    1.0 / (head_dim as f32).sqrt()
 }
 
 vectorized! {
-    /// Scores and softmax of every query, group by group and head by head; exactly zero where unseen.
-    fn soften<'a>(
+    /// Every query's scores less the largest of them, group by group and head by head; −∞ where unseen.
+    fn score<'a>(
         queries: View<'a>,
         key_values: &'a [f32],
         groups: &'a [Group],
         visible: Visible<'a>,
-        weights: &'a mut [f32],
-        scale: f32,
+        scores: &'a mut [f32],
         head_dim: usize,
     ) {
-        let a = queries.cols;
         for group in groups {
-            let (keys, pairs) = (group.keys.len(), group.pairs());
-            let key_values = &key_values[group.keys.start * 2 * a..group.keys.end * 2 * a];
+            let pairs = group.pairs();
+            let (keys, _) = keys_and_values(key_values, group, queries.cols);
             let seen = visible.take(pairs);
-            for head in (0..a).step_by(head_dim) {
-                let weights = take(&mut weights, pairs);
-                for (at, weights) in weights.chunks_exact_mut(keys).enumerate() {
+            for head in (0..queries.cols).step_by(head_dim) {
+                let scores = take(&mut scores, pairs);
+                for (at, scores) in scores.chunks_exact_mut(keys.rows).enumerate() {
                     let q = &queries.row(group.queries.start + at)[head..head + head_dim];
-                    let sees = |key: usize| seen.is_none_or(|seen| seen[at * keys + key] != 0);
                     let mut largest = f32::NEG_INFINITY;
-                    for (key, (weight, key_value)) in weights.iter_mut().zip(key_values.chunks_exact(2 * a)).enumerate() {
-                        *weight = scale * math::dot(q, &key_value[head..head + head_dim]);
-                        if sees(key) {
-                            largest = largest.max(*weight);
-                        }
+                    for (key, score) in scores.iter_mut().enumerate() {
+                        let sees = seen.is_none_or(|seen| seen[at * keys.rows + key] != 0);
+                        let product = scale(head_dim) * math::dot(q, &keys.row(key)[head..head + head_dim]);
+                        *score = if sees { product } else { f32::NEG_INFINITY };
+                        largest = largest.max(*score);
                     }
-                    let mut total = 0.0;
-                    for (key, weight) in weights.iter_mut().enumerate() {
-                        // An unseen key weighs exactly nothing.
-                        *weight = if sees(key) { math::exp(*weight - largest) } else { 0.0 };
-                        total += *weight;
-                    }
-                    // Who sees nothing keeps the zeros.
-                    if total > 0.0 {
-                        weights.iter_mut().for_each(|weight| *weight /= total);
+                    // Who sees nothing keeps −∞, which less itself is no number.
+                    if largest > f32::NEG_INFINITY {
+                        scores.iter_mut().for_each(|score| *score -= largest);
                     }
                 }
             }
@@ -248,34 +181,118 @@ vectorized! {
 }
 
 vectorized! {
-    /// Turns weights into the gradient by the scores, before their scaling.
-    fn soften_backward<'a>(
-        d_out: View<'a>,
-        values: View<'a>,
+    /// e^x in place; exactly nothing for −∞.
+    fn exponentiate<'a>(x: &'a mut [f32]) {
+        for x in x {
+            *x = if *x == f32::NEG_INFINITY { 0.0 } else { math::exp(*x) };
+        }
+    }
+}
+
+vectorized! {
+    /// Makes softmax weights of exponentials, in place, and `out` of the values by these weights.
+    fn blend<'a>(
+        key_values: &'a [f32],
         groups: &'a [Group],
         weights: &'a mut [f32],
-        scale: f32,
+        out: ViewMut<'a>,
         head_dim: usize,
     ) {
-        let mut d_weights: Vec<f32> = Vec::new();
         for group in groups {
-            for head in (0..values.cols).step_by(head_dim) {
+            let (_, values) = keys_and_values(key_values, group, out.cols);
+            for head in (0..out.cols).step_by(head_dim) {
                 let weights = take(&mut weights, group.pairs());
-                for (query, weights) in group.queries.clone().zip(weights.chunks_exact_mut(group.keys.len())) {
-                    let d_out = &d_out.row(query)[head..head + head_dim];
-                    d_weights.resize(weights.len(), 0.0);
-                    let mut mean = 0.0;
-                    for (key, (weight, d_weight)) in group.keys.clone().zip(weights.iter().zip(&mut d_weights)) {
-                        *d_weight = math::dot(d_out, &values.row(key)[head..head + head_dim]);
-                        mean += weight * *d_weight;
+                for (query, weights) in group.queries.clone().zip(weights.chunks_exact_mut(values.rows)) {
+                    let total: f32 = weights.iter().sum();
+                    // Who sees nothing keeps the zeros.
+                    if total > 0.0 {
+                        weights.iter_mut().for_each(|weight| *weight /= total);
                     }
-                    for (weight, d_weight) in weights.iter_mut().zip(&d_weights) {
-                        *weight *= (d_weight - mean) * scale;
-                    }
+                    let to = out.row(query);
+                    for_lanes!(head..head + head_dim, |at, len| {
+                        store(weighted_sum(weights, 1, values, at, len), to, at, len);
+                    });
                 }
             }
         }
     }
+}
+
+vectorized! {
+    /// From the gradient by the output to those by queries and by keys and values: `d`, all of it written. With w
+    /// the weights: d_value = wᵀ d_out where ReLU let it pass, d_w = d_out valueᵀ, d_score = w (d_w − Σ w d_w),
+    /// d_query = d_score key and d_key = d_scoreᵀ query.
+    fn attend_backward<'a>(
+        d_out: View<'a>,
+        queries: View<'a>,
+        key_values: &'a [f32],
+        groups: &'a [Group],
+        weights: &'a [f32],
+        d: (&'a mut [f32], &'a mut [f32]),
+        head_dim: usize,
+    ) {
+        let a = queries.cols;
+        let (d_queries, d_key_values) = d;
+        let mut d_scores = Vec::new();
+        for group in groups {
+            let (keys, values) = keys_and_values(key_values, group, a);
+            let (queries, d_out) = (queries.rows(group.queries.clone()), d_out.rows(group.queries.clone()));
+            let d_queries = &mut d_queries[group.queries.start * a..group.queries.end * a];
+            let d_key_values = &mut d_key_values[group.keys.start * 2 * a..group.keys.end * 2 * a];
+            for head in (0..a).step_by(head_dim) {
+                let (weights_here, behind) = weights.split_at(group.pairs());
+                weights = behind;
+                d_scores.clear();
+                for (query, weights) in weights_here.chunks_exact(keys.rows).enumerate() {
+                    let d_out = &d_out.row(query)[head..head + head_dim];
+                    let mut mean = 0.0;
+                    for (key, weight) in weights.iter().enumerate() {
+                        let d_weight = math::dot(d_out, &values.row(key)[head..head + head_dim]);
+                        mean += weight * d_weight;
+                        d_scores.push(d_weight);
+                    }
+                    let d_scores = &mut d_scores[query * keys.rows..];
+                    for (d_score, weight) in d_scores.iter_mut().zip(weights) {
+                        *d_score = weight * (*d_score - mean) * scale(head_dim);
+                    }
+                    for_lanes!(head..head + head_dim, |at, len| {
+                        let d_query = weighted_sum(d_scores, 1, keys, at, len);
+                        store(d_query, &mut d_queries[query * a..][..a], at, len);
+                    });
+                }
+                for key in 0..keys.rows {
+                    let d_key_value = &mut d_key_values[key * 2 * a..][..2 * a];
+                    for_lanes!(head..head + head_dim, |at, len| {
+                        let d_key = weighted_sum(&d_scores[key..], keys.rows, queries, at, len);
+                        store(d_key, d_key_value, at, len);
+                        let d_value = weighted_sum(&weights_here[key..], keys.rows, d_out, at, len);
+                        let value = load(values.row(key), at, len);
+                        let d_value = each(|lane| if value[lane] > 0.0 { d_value[lane] } else { 0.0 });
+                        store(d_value, d_key_value, a + at, len);
+                    });
+                }
+            }
+        }
+    }
+}
+
+/// One group's keys and values, (keys, a) each.
+#[inline(always)]
+fn keys_and_values<'a>(key_values: &'a [f32], group: &Group, a: usize) -> (View<'a>, View<'a>) {
+    let both = View { data: key_values, rows: key_values.len() / (2 * a), cols: 2 * a, stride: 2 * a };
+    let both = both.rows(group.keys.clone());
+    (both.columns(0..a), both.columns(a..2 * a))
+}
+
+/// Σ weights[i · stride] · row i, in the `len` columns from `at` on.
+#[inline(always)]
+fn weighted_sum(weights: &[f32], stride: usize, rows: View<'_>, at: usize, len: usize) -> Lanes {
+    let mut sum = [0.0; LANES];
+    for (row, &weight) in weights.iter().step_by(stride).enumerate() {
+        let x = load(rows.row(row), at, len);
+        sum = each(|lane| weight.mul_add(x[lane], sum[lane]));
+    }
+    sum
 }
 
 /// Splits the next `len` elements off the front.
@@ -389,7 +406,7 @@ mod tests {
         params: &[f32],
         xq: &[f32],
         xk: &[f32],
-        state: &mut AttentionState,
+        state: &AttentionState,
         d_out: &[f32],
     ) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
         let (mut dxq, mut dxk, mut grads) =
@@ -413,9 +430,9 @@ mod tests {
     fn who_sees_nothing_gets_exactly_zero_and_passes_no_gradient() {
         let (attention, len) = unit(2);
         let (params, xq, xk) = (noise(1, len), noise(2, 3 * INPUTS), noise(3, 5 * INPUTS));
-        let (out, mut state) = run(&attention, &params, &xq, &xk, Visible::Where(&SEEN));
+        let (out, state) = run(&attention, &params, &xq, &xk, Visible::Where(&SEEN));
         assert_eq!(out[2 * DIM..], [0.0; DIM]);
-        let (dxq, dxk, _) = backward(&attention, &params, &xq, &xk, &mut state, &noise(4, 3 * DIM));
+        let (dxq, dxk, _) = backward(&attention, &params, &xq, &xk, &state, &noise(4, 3 * DIM));
         assert_eq!(dxq[2 * INPUTS..], [0.0; INPUTS]);
         assert_eq!(dxk[3 * INPUTS..], [0.0; 2 * INPUTS]);
     }
@@ -430,8 +447,8 @@ mod tests {
                 let (out, _) = run(&attention, params, xq, xk, visible);
                 out.iter().zip(&to).map(|(out, to)| f64::from(out * to)).sum()
             };
-            let (_, mut state) = run(&attention, &params, &xq, &xk, visible);
-            let (dxq, dxk, grads) = backward(&attention, &params, &xq, &xk, &mut state, &to);
+            let (_, state) = run(&attention, &params, &xq, &xk, visible);
+            let (dxq, dxk, grads) = backward(&attention, &params, &xq, &xk, &state, &to);
             check("params", &params, &grads, |params| loss(params, &xq, &xk));
             check("queries", &xq, &dxq, |xq| loss(&params, xq, &xk));
             check("keys", &xk, &dxk, |xk| loss(&params, &xq, xk));

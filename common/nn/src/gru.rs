@@ -4,7 +4,7 @@
 //! time are a prefix of those before: sequences are ordered longest first.
 
 use crate::{
-    LayoutBuilder, Linear, Scratch, View, ViewMut, fit, linear,
+    LayoutBuilder, Linear, Scratch, View, ViewMut, fit, for_lanes, linear,
     math::{LANES, Lanes, each, load, sigmoid, store, tanh},
     matmul, vectorized,
 };
@@ -158,8 +158,7 @@ vectorized! {
         for row in 0..next.len() / h {
             let gates = &mut gates[row * 3 * h..][..3 * h];
             let from_hidden = &from_hidden[row * 3 * h..][..3 * h];
-            for at in (0..h).step_by(LANES) {
-                let len = LANES.min(h - at);
+            for_lanes!(0..h, |at, len| {
                 let r = gate_sum(gates, from_hidden, input, hidden, at, len);
                 let u = gate_sum(gates, from_hidden, input, hidden, h + at, len);
                 let (r, u) = (each(|lane| sigmoid(r[lane])), each(|lane| sigmoid(u[lane])));
@@ -174,7 +173,7 @@ vectorized! {
                 store(n, gates, 2 * h + at, len);
                 store(hn, new_from_hidden, row * h + at, len);
                 store(new, next, row * h + at, len);
-            }
+            });
         }
     }
 }
@@ -195,8 +194,7 @@ vectorized! {
         for row in 0..d_next.len() / h {
             let gates = &mut gates[row * 3 * h..][..3 * h];
             let d_from_hidden = &mut d_from_hidden[row * 3 * h..][..3 * h];
-            for at in (0..h).step_by(LANES) {
-                let len = LANES.min(h - at);
+            for_lanes!(0..h, |at, len| {
                 let (r, u) = (load(gates, at, len), load(gates, h + at, len));
                 let n = load(gates, 2 * h + at, len);
                 let hn = load(new_from_hidden, row * h + at, len);
@@ -218,7 +216,7 @@ vectorized! {
                 store(dr, d_from_hidden, at, len);
                 store(du, d_from_hidden, h + at, len);
                 store(d_hn, d_from_hidden, 2 * h + at, len);
-            }
+            });
         }
     }
 }

@@ -109,30 +109,33 @@ pub type Lanes = [f32; LANES];
 /// The `len` numbers that begin at `at`.
 #[inline(always)]
 pub fn load(from: &[f32], at: usize, len: usize) -> Lanes {
-    if len == LANES
-        && let Some(lanes) = from[at..].first_chunk()
-    {
-        return *lanes;
-    }
     let mut lanes = [0.0; LANES];
-    for (lane, x) in lanes.iter_mut().zip(&from[at..at + len]) {
-        *lane = *x;
-    }
+    lanes[..len].copy_from_slice(&from[at..at + len]);
     lanes
 }
 
 /// Writes `len` numbers to where `at` is.
 #[inline(always)]
 pub fn store(lanes: Lanes, to: &mut [f32], at: usize, len: usize) {
-    if len == LANES
-        && let Some(to) = to[at..].first_chunk_mut()
-    {
-        *to = lanes;
-        return;
-    }
-    for (x, lane) in to[at..at + len].iter_mut().zip(lanes) {
-        *x = lane;
-    }
+    to[at..at + len].copy_from_slice(&lanes[..len]);
+}
+
+/// Goes through a range of columns lanes by lanes: `for_lanes!(range, |at, len| { … })`. The body is compiled for whole
+/// lanes and for the rest apart: a length that the compiler knows makes a load one instruction.
+#[macro_export]
+macro_rules! for_lanes {
+    ($range:expr, |$at:ident, $len:ident| $body:block) => {{
+        let std::ops::Range { start, end } = $range;
+        let whole = end - (end - start) % $crate::math::LANES;
+        for $at in (start..whole).step_by($crate::math::LANES) {
+            let $len = $crate::math::LANES;
+            $body
+        }
+        if whole < end {
+            let ($at, $len) = (whole, end - whole);
+            $body
+        }
+    }};
 }
 
 /// A function of each lane's number.

@@ -186,7 +186,8 @@ fn the_twenty_fifth_step_is_terminal() {
 /// Three bodies in a row, 0.5 and 0.25 apart: two agents and a landmark.
 fn row(view_radius: Option<f32>) -> Observation {
     let bodies = vec![DISC, DISC, Body::new(BodyKind::Landmark, 0.05)];
-    let mut world = World::new(bodies, 2, EnvironmentOptions { view_radius, ..EnvironmentOptions::default() });
+    let mut world =
+        World::new(bodies, 2, EnvironmentOptions { view_radius, ..EnvironmentOptions::default() });
     world.place(&[[0.0, 0.25], [0.5, 0.25], [0.75, 0.25]]);
     world.bodies[1].velocity = [-1.0, 2.0];
     let mut observation = Observation::new(2, 3, FEATURES, DIRECTIONS.len());
