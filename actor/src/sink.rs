@@ -3,7 +3,7 @@
 
 use bytes::Bytes;
 use rit_episode::wire::Frame;
-use rit_ipc::{EpisodeSender, FRAMES_PER_SENDER, SendError};
+use rit_ipc::{EpisodeSender, SendError};
 use rit_proto::{
     transport::Client,
     v1::{self, episodes_client::EpisodesClient},
@@ -60,6 +60,9 @@ impl EpisodeSink {
     }
 }
 
+/// Frames on the way that the learner has not read.
+const UNREAD_MAX: usize = 8;
+
 /// `rit.v1.Episodes`, an actor's end.
 #[derive(Debug)]
 pub(crate) struct FrameStream {
@@ -73,7 +76,7 @@ pub(crate) struct FrameStream {
 impl FrameStream {
     /// Begins a stream.
     pub(crate) async fn open(client: Client) -> Result<Self, tonic::Status> {
-        let (frames, queue) = mpsc::channel(FRAMES_PER_SENDER);
+        let (frames, queue) = mpsc::channel(UNREAD_MAX);
         let answer = EpisodesClient::new(client).send(ReceiverStream::new(queue)).await?;
         let mut receipts = answer.into_inner();
         let (count, read) = watch::channel(0);
@@ -89,8 +92,7 @@ impl FrameStream {
     }
 
     fn send(&mut self, frame: &Frame, give_up: &dyn Fn() -> bool) -> Result<(), SinkError> {
-        // As many frames on the way as in shared memory.
-        self.wait_until_read((self.sent + 1).saturating_sub(FRAMES_PER_SENDER as u64), give_up)?;
+        self.wait_until_read((self.sent + 1).saturating_sub(UNREAD_MAX as u64), give_up)?;
         let frame = v1::Frame {
             header: Bytes::copy_from_slice(frame.header.as_bytes()),
             payload: Bytes::copy_from_slice(&frame.payload),

@@ -62,7 +62,7 @@ mod run_space;
 mod sender;
 mod shared_memory;
 
-pub use limits::{FRAMES_PER_SENDER, Limits};
+pub use limits::Limits;
 pub use node::{IceoryxError, Reaped};
 pub use receiver::{CreateError, EpisodeReceiver, ReceiveError, ReceivedFrame};
 pub use run_space::{DirectoryError, RemoveError, RunSpace, RunSpaceError};

@@ -1,7 +1,13 @@
 //! How much of everything a run may have.
 
-/// Frames one sender may have on the way, by default: enough that neither side waits for the other's wake-up.
-pub const FRAMES_PER_SENDER: usize = 8;
+use std::ops::RangeInclusive;
+
+/// Frames one sender may have on the way, by default as many as take [`SENDER_BYTES`]: enough that the learner, while a
+/// sender sleeps that was ahead, does not run dry and sleep too. With frames of 64 KiB, from 8 to 16 and 32 of them, a
+/// frame cost both sides together 17.4, 13.8 and 13.2 µs. Frames that take longer to copy than a sender sleeps do with
+/// fewer.
+const FRAMES_PER_SENDER: RangeInclusive<usize> = 8..=32;
+const SENDER_BYTES: usize = 2 << 20;
 
 /// Places beyond one for each actor: a restarted actor may come before its dead self is reaped.
 const RESTART_ROOM: usize = 2;
@@ -27,7 +33,9 @@ pub struct Limits {
 impl Limits {
     /// Limits for so many actors, with room for restarted ones.
     pub fn new(payload_len: usize, actors: usize) -> Self {
-        Self { payload_len, max_senders: actors + RESTART_ROOM, frames_per_sender: FRAMES_PER_SENDER }
+        let (fewest, most) = FRAMES_PER_SENDER.into_inner();
+        let frames_per_sender = (SENDER_BYTES / payload_len.max(1)).clamp(fewest, most);
+        Self { payload_len, max_senders: actors + RESTART_ROOM, frames_per_sender }
     }
 
     /// Shared memory the run needs when every place is taken, in bytes. A little more than that, for iceoryx2's

@@ -25,7 +25,7 @@ fn an_episode_comes_out_as_it_went_in() {
     observation.available_mut(0).fill(1);
     observation.available_mut(1).fill(1);
     let mut builder = EpisodeBuilder::new(17, 3, 0, vec![1, 0], &observation);
-    builder.step(&[0, 1], -1.5, &observation);
+    builder.step(&[0, 1], -1.5, 0.0, &observation);
     let episode = builder.finish(End::Terminated, true);
     let layout = PayloadLayout::new(dims);
     let mut sent = Frame::new(&layout);

@@ -7,14 +7,20 @@ use bytemuck::Zeroable as _;
 use rit_episode::wire::{ALIGNMENT, Frame, Header};
 use rit_ipc::{EpisodeReceiver, EpisodeSender, Limits, RunSpace};
 use std::{
-    hint::black_box,
-    sync::atomic::{AtomicBool, Ordering},
+    hint::{self, black_box},
+    sync::{
+        Mutex, PoisonError,
+        atomic::{AtomicBool, AtomicU64, Ordering},
+    },
     thread,
     time::{Duration, Instant},
 };
 
 /// How long a wait for frames lasts at most.
 const WAIT: Duration = Duration::from_millis(100);
+
+/// How long the bare handover is measured at most.
+const HANDOVER_AT_MOST: Duration = Duration::from_secs(2);
 
 /// Memory that received frames are copied to in turn, as into replay: larger than the caches.
 const REPLAY_BYTES: usize = 256 << 20;
@@ -28,6 +34,7 @@ pub(super) fn run(payload_kib: usize, duration: Duration) -> Result<Report, Fail
     let (items, cpu) = measured?;
     let per_item = cpu / items as f64;
     let copies = two_copies_s(payload_len);
+    let handover = handover_s(payload_len, duration.min(HANDOVER_AT_MOST));
 
     let mut report = Report::new();
     report.insert("items_per_cpu_s".into(), (1.0 / per_item).into());
@@ -36,6 +43,10 @@ pub(super) fn run(payload_kib: usize, duration: Duration) -> Result<Report, Fail
     report.insert("two_memcpys_cpu_us".into(), (1e6 * copies).into());
     report
         .insert("limit".into(), "one thread copies the bytes in, and out to memory of replay's size".into());
+    report.insert("handover_share".into(), (handover / per_item).into());
+    report.insert("handover_cpu_us".into(), (1e6 * handover).into());
+    report
+        .insert("handover".into(), "the same two copies, each on a core of its own, and nothing else".into());
     report.insert("payload_bytes".into(), payload_len.into());
     report.insert("items".into(), items.into());
     Ok(report)
@@ -97,4 +108,54 @@ fn two_copies_s(len: usize) -> f64 {
     }
     black_box(&replay);
     best
+}
+
+/// Seconds that two plain copies of so many bytes take when what one core has written another one reads: through as many
+/// slots as a sender has, without anything else. What it takes longer than [`two_copies_s`] no transport can save.
+fn handover_s(len: usize, duration: Duration) -> f64 {
+    let slots = Limits::new(len, 1).frames_per_sender;
+    let slots: Vec<Mutex<Vec<u8>>> = (0..slots).map(|_| Mutex::new(vec![1; len])).collect();
+    let (written, read, stop) = (AtomicU64::new(0), AtomicU64::new(0), AtomicBool::new(false));
+    let slot = |item: u64| &slots[item as usize % slots.len()];
+    // Never contended: the counts say whose turn it is. Copies alone are timed, not the waits between them.
+    let timed = |slot: &Mutex<Vec<u8>>, copy: &mut dyn FnMut(&mut [u8])| {
+        let mut slot = slot.lock().unwrap_or_else(PoisonError::into_inner);
+        let begun = Instant::now();
+        copy(&mut slot);
+        begun.elapsed()
+    };
+    thread::scope(|scope| {
+        let writing = scope.spawn(|| {
+            let (source, mut spent) = (vec![7_u8; len], Duration::ZERO);
+            for item in 0.. {
+                while item - read.load(Ordering::Acquire) >= slots.len() as u64 {
+                    if stop.load(Ordering::Relaxed) {
+                        return spent;
+                    }
+                    hint::spin_loop();
+                }
+                spent += timed(slot(item), &mut |slot| slot.copy_from_slice(black_box(&source)));
+                written.store(item + 1, Ordering::Release);
+            }
+            spent
+        });
+        let mut replay = vec![1_u8; (REPLAY_BYTES / len).max(1) * len];
+        let (begun, mut spent, mut items) = (Instant::now(), Duration::ZERO, 0);
+        for place in (0..replay.len() / len).cycle() {
+            if begun.elapsed() >= duration {
+                break;
+            }
+            while written.load(Ordering::Acquire) <= items {
+                hint::spin_loop();
+            }
+            let to = &mut replay[place * len..][..len];
+            spent += timed(slot(items), &mut |slot| to.copy_from_slice(black_box(slot)));
+            items += 1;
+            read.store(items, Ordering::Release);
+        }
+        stop.store(true, Ordering::Relaxed);
+        // Slots that were written and not read: a few of very many.
+        let writing = writing.join().unwrap_or_default();
+        (spent + writing).as_secs_f64() / items as f64
+    })
 }
