@@ -225,6 +225,7 @@ fn by_reason<'a>(name: &'static str, help: &'static str, counts: &'a HashMap<Str
 mod tests {
     use super::*;
     use rit_proto::v1::{CheckpointsStatus, Evaluation, LedgerStatus, Rates};
+    use std::{collections::HashSet, fs, path::Path};
 
     fn status() -> RunStatus {
         let result = |task: &str, win_rate, lag| TaskResult {
@@ -319,6 +320,21 @@ mod tests {
             "a task that knows no winning"
         );
         assert!(types.keys().all(|name| name.starts_with("rit_")));
+    }
+
+    #[test]
+    fn dashboards_and_alerts_ask_for_what_there_is() {
+        let (samples, _) = parse(&render(status()).unwrap());
+        let names: HashSet<&str> = samples.keys().filter_map(|key| key.split('{').next()).collect();
+        let deploy = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy");
+        for file in ["grafana/rit.json", "prometheus/rit.rules.yml", "prometheus/rit.rules.test.yml"] {
+            let text = fs::read_to_string(deploy.join(file)).unwrap();
+            let words = text.split(|c: char| !(c.is_ascii_alphanumeric() || c == '_'));
+            let asked: HashSet<&str> = words.filter(|word| word.starts_with("rit_")).collect();
+            assert!(!asked.is_empty(), "{file} asks for something");
+            let unknown: Vec<_> = asked.difference(&names).collect();
+            assert!(unknown.is_empty(), "{file} asks for {unknown:?}");
+        }
     }
 
     #[test]
