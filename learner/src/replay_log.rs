@@ -212,6 +212,7 @@ pub fn read(folder: &Path, expected: &Expected, numbers: Range<u64>) -> Result<V
                     Ok(io::BufReader::with_capacity(1 << 20, file))
                 });
                 let reader = opened.map_err(|error| ReplayLogError::Io { path: path.clone(), error })?;
+                refuse_other_layouts(&path, number)?;
                 file.insert((path, reader))
             }
         };
@@ -228,6 +229,19 @@ pub fn read(folder: &Path, expected: &Expected, numbers: Range<u64>) -> Result<V
         episodes.push(episode);
     }
     Ok(episodes)
+}
+
+/// Another build's frames may be of another length: looked for in their places, they would not be found. The first frame
+/// begins with the file whatever its length.
+fn refuse_other_layouts(path: &Path, number: u64) -> Result<(), ReplayLogError> {
+    let mut header: Header = bytemuck::Zeroable::zeroed();
+    let first = File::open(path).and_then(|mut file| file.read_exact(bytemuck::bytes_of_mut(&mut header)));
+    // A file too short, or one that begins with an empty place, is for the reader to find.
+    if first.is_ok() && header.magic == wire::MAGIC && header.layout_version != wire::LAYOUT_VERSION {
+        let rejection = Rejection::LayoutVersion { found: header.layout_version };
+        return Err(ReplayLogError::Frame { path: path.to_owned(), number, rejection });
+    }
+    Ok(())
 }
 
 fn frame_len(layout: &PayloadLayout) -> u64 {
@@ -342,6 +356,10 @@ mod tests {
         let swapped = [&good[frame..2 * frame], &good[..frame], &good[2 * frame..]].concat();
         assert!(error(&swapped).contains("episode 1 lies where 0 should"));
         assert!(error(&good[..good.len() - 1]).contains("failed to fill whole buffer"));
+        // Frames of another build are of another length.
+        let mut old = [&good[..frame - 8], &good[frame..]].concat();
+        old[8] -= 1;
+        assert!(error(&old).contains("the frame's layout is version 1, this build reads 2"), "{}", error(&old));
     }
 
     #[test]
