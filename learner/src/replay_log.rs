@@ -359,7 +359,11 @@ mod tests {
         // Frames of another build are of another length.
         let mut old = [&good[..frame - 8], &good[frame..]].concat();
         old[8] -= 1;
-        assert!(error(&old).contains("the frame's layout is version 1, this build reads 2"), "{}", error(&old));
+        assert!(
+            error(&old).contains("the frame's layout is version 1, this build reads 2"),
+            "{}",
+            error(&old)
+        );
     }
 
     #[test]

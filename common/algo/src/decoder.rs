@@ -454,7 +454,7 @@ fn counted_softmax(scores: &[f32], bias: &[f32], counts: &[f32], weights: &mut [
     }
     let mut total = 0.0;
     for (weight, &count) in weights.iter_mut().zip(counts) {
-        *weight = if count > 0.0 { count * math::exp(*weight - largest) } else { 0.0 };
+        *weight = if count > 0.0 { count * math::exp_share(*weight - largest) } else { 0.0 };
         total += *weight;
     }
     // The start token is always seen, so the total is not zero.

@@ -181,10 +181,10 @@ vectorized! {
 }
 
 vectorized! {
-    /// e^x in place; exactly nothing for −∞.
+    /// Shares of a softmax before their division, in place.
     fn exponentiate<'a>(x: &'a mut [f32]) {
         for x in x {
-            *x = if *x == f32::NEG_INFINITY { 0.0 } else { math::exp(*x) };
+            *x = math::exp_share(*x);
         }
     }
 }
@@ -435,6 +435,20 @@ mod tests {
         let (dxq, dxk, _) = backward(&attention, &params, &xq, &xk, &state, &noise(4, 3 * DIM));
         assert_eq!(dxq[2 * INPUTS..], [0.0; INPUTS]);
         assert_eq!(dxk[3 * INPUTS..], [0.0; 2 * INPUTS]);
+    }
+
+    /// Weights as those of trained networks, which are sure of where to look: what else there is gets exactly nothing,
+    /// and no gradient of it is subnormal.
+    #[test]
+    fn what_weighs_next_to_nothing_weighs_nothing() {
+        let (attention, len) = unit(1);
+        let large = |seed, len| -> Vec<f32> { noise(seed, len).iter().map(|x| 12.0 * x).collect() };
+        let (params, xq, xk) = (large(1, len), large(2, 3 * INPUTS), large(3, 5 * INPUTS));
+        let (_, state) = run(&attention, &params, &xq, &xk, Visible::All);
+        assert!(state.weights.contains(&0.0) && state.weights.iter().all(|&w| w == 0.0 || w > 1e-21));
+        let d_out: Vec<f32> = noise(4, 3 * DIM).iter().map(|d| 1e-6 * d).collect();
+        let (dxq, dxk, grads) = backward(&attention, &params, &xq, &xk, &state, &d_out);
+        assert!([dxq, dxk, grads].concat().iter().all(|d| !d.is_subnormal()));
     }
 
     #[test]

@@ -87,6 +87,23 @@ pub fn exp(x: f32) -> f32 {
     p * f32::from_bits(((exponent + 127) << 23) as u32)
 }
 
+/// A softmax's e^x, x less the largest: exactly zero where it is less than 1e-20 of the largest, for x = −∞ too.
+///
+/// So small a share counts for nothing in a sum, but its gradients are so small that their products become subnormal, and
+/// arithmetic with subnormal numbers takes a hundred times as long on some processors: trained networks, which are sure
+/// of where to look, took three times as long as fresh ones.
+#[inline(always)]
+pub fn exp_share(x: f32) -> f32 {
+    const LN_1E_20: f32 = -46.051_7;
+    if x < LN_1E_20 { 0.0 } else { exp(x) }
+}
+
+/// Zero for a subnormal number: what decays for ever stops there.
+#[inline(always)]
+pub fn normal(x: f32) -> f32 {
+    if x.abs() < f32::MIN_POSITIVE { 0.0 } else { x }
+}
+
 /// 1 / (1 + e^−x).
 #[inline(always)]
 pub fn sigmoid(x: f32) -> f32 {

@@ -1,6 +1,6 @@
 //! RMSprop and Adam as PyTorch defines them, and clipping by the global norm.
 
-use crate::vectorized;
+use crate::{math::normal, vectorized};
 
 /// Which optimiser, with its own constants.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -77,7 +77,7 @@ vectorized! {
         let [scale, lr, alpha, eps] = constants;
         for ((p, g), v) in params.iter_mut().zip(grads).zip(mean_square) {
             let g = g * scale;
-            *v = alpha * *v + (1.0 - alpha) * g * g;
+            *v = normal(alpha * *v + (1.0 - alpha) * g * g);
             *p -= lr * g / (v.sqrt() + eps);
         }
     }
@@ -94,8 +94,8 @@ vectorized! {
         let moments = moments.0.iter_mut().zip(moments.1);
         for ((p, g), (m, v)) in params.iter_mut().zip(grads).zip(moments) {
             let g = g * scale;
-            *m = beta1 * *m + (1.0 - beta1) * g;
-            *v = beta2 * *v + (1.0 - beta2) * g * g;
+            *m = normal(beta1 * *m + (1.0 - beta1) * g);
+            *v = normal(beta2 * *v + (1.0 - beta2) * g * g);
             *p -= rate * *m / (v.sqrt() / root + eps);
         }
     }
@@ -153,6 +153,21 @@ mod tests {
         optimizer.step(&mut p, &[-1.0], 1.0);
         let (m, v): (f64, f64) = (0.9 * 0.05 - 0.1, 0.99 * 0.0025 + 0.01);
         close(p[0], 0.9 - 0.1 * (m / 0.19) / (v / 0.0199).sqrt());
+    }
+
+    #[test]
+    fn moments_without_gradients_end_at_zero() {
+        let adam = OptimizerKind::Adam { beta1: 0.9, beta2: 0.99, eps: 1e-8 };
+        for kind in [adam, OptimizerKind::RmsProp { alpha: 0.9, eps: 0.01 }] {
+            let (mut optimizer, mut p) = (Optimizer::new(kind, 0.1, 1), [1.0]);
+            optimizer.step(&mut p, &[0.5], 1.0);
+            for _ in 0..20_000 {
+                optimizer.step(&mut p, &[0.0], 1.0);
+                let moments = [&optimizer.mean[..], &optimizer.mean_square].concat();
+                assert!(!moments.iter().any(|moment| moment.is_subnormal()), "{moments:?}");
+            }
+            assert!(optimizer.mean.iter().chain(&optimizer.mean_square).all(|&moment| moment == 0.0));
+        }
     }
 
     #[test]
