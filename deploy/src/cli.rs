@@ -283,10 +283,13 @@ pub struct BenchOptions {
     #[arg(value_enum)]
     pub kind: BenchKind,
     /// Experiment whose sizes and tasks are used
-    #[arg(long, default_value = "cooperative-navigation")]
+    #[arg(long, default_value = "cooperative-navigation", conflicts_with = "run")]
     pub experiment: String,
+    /// Run whose configuration and newest weights are used instead of fresh ones, for learner and rollout
+    #[arg(long, value_name = "DIR")]
+    pub run: Option<PathBuf>,
     /// Set any key of it; may be given again and again
-    #[arg(long = "set", value_name = "KEY=VALUE")]
+    #[arg(long = "set", value_name = "KEY=VALUE", conflicts_with = "run")]
     pub settings: Vec<String>,
     /// How long to measure
     #[arg(long, default_value_t = 5.0, value_parser = positive)]

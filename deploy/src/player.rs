@@ -10,7 +10,7 @@ use rit_learner::{
     trainer::evaluation_seed,
     weights_file,
 };
-use std::sync::Arc;
+use std::{path::Path, sync::Arc};
 
 /// The policy of a checkpoint, as it is typed.
 const CHECKPOINT: &str = "checkpoint";
@@ -27,6 +27,36 @@ pub struct Player {
     pub policy: Box<dyn Policy>,
     /// Digest of the weights, where it has any.
     pub weights_digest: Option<String>,
+}
+
+/// What a run has come to.
+pub struct Trained {
+    /// The run's configuration.
+    pub config: Config,
+    /// Its model.
+    pub rit: Arc<Rit>,
+    /// All parameters of its newest checkpoint.
+    pub params: Vec<f32>,
+}
+
+impl Trained {
+    /// Reads the run's newest checkpoint.
+    ///
+    /// # Errors
+    /// When it has none, or it is not as it was written.
+    pub fn load(run: &Path) -> Result<Self, Failure> {
+        let (run_dir, config) = RunDir::open(run)?;
+        let path = run_dir.checkpoints().join(LATEST).join(WEIGHTS);
+        if !path.exists() {
+            let root = run_dir.root().display();
+            return Err(Failure::input_message(format!(
+                "{root} has no checkpoint yet; `rit ctl --run {root} checkpoint` writes one"
+            )));
+        }
+        let rit = Arc::new(Rit::new(config.rit()).map_err(Failure::input)?);
+        let params = weights_file::load(&path, &rit)?;
+        Ok(Self { config, rit, params })
+    }
 }
 
 impl Player {
@@ -82,16 +112,7 @@ impl Player {
                 "give --run DIR, whose checkpoint plays, or a --policy {SCRIPT}NAME that needs none"
             )));
         };
-        let (run_dir, config) = RunDir::open(run)?;
-        let path = run_dir.checkpoints().join(LATEST).join(WEIGHTS);
-        if !path.exists() {
-            let root = run_dir.root().display();
-            return Err(Failure::input_message(format!(
-                "{root} has no checkpoint yet; `rit ctl --run {root} checkpoint` writes one"
-            )));
-        }
-        let rit = Arc::new(Rit::new(config.rit()).map_err(Failure::input)?);
-        let params = weights_file::load(&path, &rit)?;
+        let Trained { config, rit, params } = Trained::load(run)?;
         let policy = Box::new(Acting::new(Arc::clone(&rit), &params[rit.acting()]));
         let weights_digest = Some(weights_file::digest(&params));
         Ok(Self { name: CHECKPOINT.to_owned(), config, policy, weights_digest })

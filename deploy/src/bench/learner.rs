@@ -1,10 +1,9 @@
 //! One learner update, as training makes it.
 
-use super::{Report, cpu_s, random_episodes, thread_cpu_s};
+use super::{Model, Report, cpu_s, random_episodes, thread_cpu_s};
 use crate::failure::Failure;
 use faer::Accum;
-use rit_algo::{Rit, Update};
-use rit_config::Config;
+use rit_algo::Update;
 use rit_env::{Split, Task};
 use rit_episode::Stream;
 use rit_learner::replay::Replay;
@@ -29,10 +28,11 @@ pub(super) struct Cost {
     pub replay_bytes: usize,
 }
 
-pub(super) fn run(config: &Config, duration: Duration) -> Result<Report, Failure> {
+pub(super) fn run(model: &Model, duration: Duration) -> Result<Report, Failure> {
+    let config = &model.config;
     let tasks = config.environment.task_set.tasks(Split::Training);
     let limit_before = large_product_flops();
-    let cost = measure(config, &tasks, config.algorithm.buffer_size, duration)?;
+    let cost = measure(model, &tasks, config.algorithm.buffer_size, duration)?;
     // A shared machine's speed drifts: the limit is measured before and after.
     let limit = f64::midpoint(limit_before, large_product_flops());
 
@@ -55,14 +55,13 @@ pub(super) fn run(config: &Config, duration: Duration) -> Result<Report, Failure
 
 /// Makes updates from a replay of so many episodes of these tasks for so long, three at least.
 pub(super) fn measure(
-    config: &Config,
+    Model { config, rit, params }: &Model,
     tasks: &[Task],
     replay_episodes: usize,
     duration: Duration,
 ) -> Result<Cost, Failure> {
-    let rit = Arc::new(Rit::new(config.rit()).map_err(Failure::input)?);
-    let params = rit.layout.initial(&mut config.seed.stream(Stream::Weights, 0));
-    let mut update = Update::new(Arc::clone(&rit), config.update(), params).map_err(Failure::runtime)?;
+    let update = Update::new(Arc::clone(rit), config.update(), params.clone());
+    let mut update = update.map_err(Failure::runtime)?;
     let mut replay = Replay::new(replay_episodes);
     let mut replay_bytes = 0;
     for episode in random_episodes(config, tasks, replay_episodes as u64) {

@@ -13,33 +13,36 @@ use crate::{
     cli::{BenchKind, BenchOptions},
     experiments,
     failure::Failure,
+    player::Trained,
 };
+use rit_algo::Rit;
 use rit_config::Config;
 use rit_env::{
     Task,
     particle::Script,
     rollout::{Job, Rollout},
 };
-use rit_episode::{Episode, RunSeed};
+use rit_episode::{Episode, RunSeed, Stream};
 use rustix::time::{ClockId, clock_gettime};
 use serde_json::{Map, Value};
-use std::{process::ExitCode, time::Duration};
+use std::{process::ExitCode, sync::Arc, time::Duration};
 
 /// `rit bench`.
 #[allow(clippy::print_stdout, reason = "what the command is for")]
 pub fn run(options: &BenchOptions) -> Result<ExitCode, Failure> {
-    let settings: Vec<String> = options.settings.clone();
-    let config = experiments::load(&options.experiment, &settings)?.config;
+    let model = Model::new(options)?;
     let duration = Duration::from_secs_f64(options.seconds);
     let mut report = match options.kind {
-        BenchKind::Learner => learner::run(&config, duration)?,
-        BenchKind::Rollout => rollout::run(&config, duration)?,
-        BenchKind::Env => env::run(&config, duration),
+        BenchKind::Learner => learner::run(&model, duration)?,
+        BenchKind::Rollout => rollout::run(&model, duration)?,
+        BenchKind::Env => env::run(&model.config, duration),
         BenchKind::Ipc => ipc::run(options.payload_kib, duration)?,
-        BenchKind::Scale => scale::run(&config, &options.experiment, &settings, duration)?,
+        BenchKind::Scale => scale::run(&model, &options.experiment, &options.settings, duration)?,
     };
     report.insert("bench".into(), options.kind.to_string().into());
-    if !matches!(options.kind, BenchKind::Ipc) {
+    if let Some(run) = &options.run {
+        report.insert("run".into(), run.display().to_string().into());
+    } else if !matches!(options.kind, BenchKind::Ipc) {
         report.insert("experiment".into(), options.experiment.clone().into());
     }
     if options.json {
@@ -58,6 +61,33 @@ pub fn run(options: &BenchOptions) -> Result<ExitCode, Failure> {
         }
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// Whose networks are measured.
+struct Model {
+    config: Config,
+    rit: Arc<Rit>,
+    params: Vec<f32>,
+}
+
+impl Model {
+    /// An experiment's fresh networks, or those that a run has come to.
+    fn new(options: &BenchOptions) -> Result<Self, Failure> {
+        let Some(run) = &options.run else {
+            let config = experiments::load(&options.experiment, &options.settings)?.config;
+            let rit = Arc::new(Rit::new(config.rit()).map_err(Failure::input)?);
+            let params = rit.layout.initial(&mut config.seed.stream(Stream::Weights, 0));
+            return Ok(Self { config, rit, params });
+        };
+        if !matches!(options.kind, BenchKind::Learner | BenchKind::Rollout) {
+            let kind = options.kind;
+            return Err(Failure::input_message(format!(
+                "`rit bench {kind}` has no use for a run's weights; --run is for learner and rollout"
+            )));
+        }
+        let Trained { config, rit, params } = Trained::load(run)?;
+        Ok(Self { config, rit, params })
+    }
 }
 
 /// Rows of one kind, a line each.

@@ -1,14 +1,13 @@
 //! Rolling episodes as an actor does: environments, acting networks, recording. No transport.
 
-use super::{Report, cpu_s};
+use super::{Model, Report, cpu_s};
 use crate::failure::Failure;
-use rit_algo::{Acting, Rit};
+use rit_algo::Acting;
 use rit_config::Config;
 use rit_env::{
     Split, Task,
     rollout::{Job, Rollout},
 };
-use rit_episode::Stream;
 use rit_nn::matmul;
 use std::{
     sync::Arc,
@@ -22,9 +21,10 @@ pub(super) struct Cost {
     pub flops: u64,
 }
 
-pub(super) fn run(config: &Config, duration: Duration) -> Result<Report, Failure> {
+pub(super) fn run(model: &Model, duration: Duration) -> Result<Report, Failure> {
+    let config = &model.config;
     let Cost { env_steps, cpu_s, flops } =
-        measure(config, config.environment.task_set.tasks(Split::Training), duration)?;
+        measure(model, config.environment.task_set.tasks(Split::Training), duration);
     let mut report = Report::new();
     report.insert("env_steps_per_cpu_s".into(), (env_steps as f64 / cpu_s).into());
     report.insert("gemm_gflop_per_cpu_s".into(), (flops as f64 / cpu_s * 1e-9).into());
@@ -38,10 +38,8 @@ fn side_by_side(config: &Config) -> u64 {
 }
 
 /// Rolls episodes of these tasks for so long.
-pub(super) fn measure(config: &Config, tasks: Vec<Task>, duration: Duration) -> Result<Cost, Failure> {
-    let rit = Arc::new(Rit::new(config.rit()).map_err(Failure::input)?);
-    let params = rit.layout.initial(&mut config.seed.stream(Stream::Weights, 0));
-    let mut acting = Acting::new(Arc::clone(&rit), &params[rit.acting()]);
+pub(super) fn measure(Model { config, rit, params }: &Model, tasks: Vec<Task>, duration: Duration) -> Cost {
+    let mut acting = Acting::new(Arc::clone(rit), &params[rit.acting()]);
     let mut rollout =
         Rollout::new(tasks, config.environment_options(), config.seed, config.algorithm.random_permutation);
     let side_by_side = side_by_side(config);
@@ -59,5 +57,5 @@ pub(super) fn measure(config: &Config, tasks: Vec<Task>, duration: Duration) -> 
     while wall.elapsed() < duration {
         env_steps += roll(&mut acting);
     }
-    Ok(Cost { env_steps, cpu_s: cpu_s() - cpu, flops: matmul::flops() - flops })
+    Cost { env_steps, cpu_s: cpu_s() - cpu, flops: matmul::flops() - flops }
 }
