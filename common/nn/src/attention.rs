@@ -96,7 +96,7 @@ impl Attention {
         let queries = View::dense(queries, self.dim);
         score(queries, key_values, groups, visible, weights, self.head_dim());
         exponentiate(weights);
-        blend(key_values, groups, weights, out, self.head_dim());
+        attend(key_values, groups, weights, out, self.head_dim());
     }
 
     /// Takes `d_out` (Q, a). Writes `dx_queries` (Q, h) and `dx_keys` (K, h) and adds to the parameters'
@@ -158,16 +158,16 @@ vectorized! {
         for group in groups {
             let pairs = group.pairs();
             let (keys, _) = keys_and_values(key_values, group, queries.cols);
+            let queries = queries.rows(group.queries.clone());
             let seen = visible.take(pairs);
-            for head in (0..queries.cols).step_by(head_dim) {
+            for head in heads(queries.cols, head_dim) {
                 let scores = take(&mut scores, pairs);
+                dots(queries.columns(head.clone()), keys.columns(head), scores);
                 for (at, scores) in scores.chunks_exact_mut(keys.rows).enumerate() {
-                    let q = &queries.row(group.queries.start + at)[head..head + head_dim];
                     let mut largest = f32::NEG_INFINITY;
                     for (key, score) in scores.iter_mut().enumerate() {
                         let sees = seen.is_none_or(|seen| seen[at * keys.rows + key] != 0);
-                        let product = scale(head_dim) * math::dot(q, &keys.row(key)[head..head + head_dim]);
-                        *score = if sees { product } else { f32::NEG_INFINITY };
+                        *score = if sees { scale(head_dim) * *score } else { f32::NEG_INFINITY };
                         largest = largest.max(*score);
                     }
                     // Who sees nothing keeps −∞, which less itself is no number.
@@ -191,7 +191,7 @@ vectorized! {
 
 vectorized! {
     /// Makes softmax weights of exponentials, in place, and `out` of the values by these weights.
-    fn blend<'a>(
+    fn attend<'a>(
         key_values: &'a [f32],
         groups: &'a [Group],
         weights: &'a mut [f32],
@@ -200,19 +200,17 @@ vectorized! {
     ) {
         for group in groups {
             let (_, values) = keys_and_values(key_values, group, out.cols);
-            for head in (0..out.cols).step_by(head_dim) {
+            for head in heads(out.cols, head_dim) {
                 let weights = take(&mut weights, group.pairs());
-                for (query, weights) in group.queries.clone().zip(weights.chunks_exact_mut(values.rows)) {
+                for weights in weights.chunks_exact_mut(values.rows) {
                     let total: f32 = weights.iter().sum();
                     // Who sees nothing keeps the zeros.
                     if total > 0.0 {
                         weights.iter_mut().for_each(|weight| *weight /= total);
                     }
-                    let to = out.row(query);
-                    for_lanes!(head..head + head_dim, |at, len| {
-                        store(weighted_sum(weights, 1, values, at, len), to, at, len);
-                    });
                 }
+                let out = out.reborrow().rows(group.queries.clone()).columns(head.clone());
+                blend(weights, values.columns(head), out);
             }
         }
     }
@@ -220,8 +218,8 @@ vectorized! {
 
 vectorized! {
     /// From the gradient by the output to those by queries and by keys and values: `d`, all of it written. With w
-    /// the weights: d_value = wᵀ d_out where ReLU let it pass, d_w = d_out valueᵀ, d_score = w (d_w − Σ w d_w),
-    /// d_query = d_score key and d_key = d_scoreᵀ query.
+    /// the weights: d_w = d_out valueᵀ, d_score = w (d_w − Σ w d_w), d_query = d_score key, d_key = d_scoreᵀ query
+    /// and d_value = wᵀ d_out where ReLU let it pass.
     fn attend_backward<'a>(
         d_out: View<'a>,
         queries: View<'a>,
@@ -239,37 +237,31 @@ vectorized! {
             let (queries, d_out) = (queries.rows(group.queries.clone()), d_out.rows(group.queries.clone()));
             let d_queries = &mut d_queries[group.queries.start * a..group.queries.end * a];
             let d_key_values = &mut d_key_values[group.keys.start * 2 * a..group.keys.end * 2 * a];
-            for head in (0..a).step_by(head_dim) {
+            let d_scores = fit(&mut d_scores, group.pairs());
+            for head in heads(a, head_dim) {
                 let (weights_here, behind) = weights.split_at(group.pairs());
                 weights = behind;
-                d_scores.clear();
-                for (query, weights) in weights_here.chunks_exact(keys.rows).enumerate() {
-                    let d_out = &d_out.row(query)[head..head + head_dim];
-                    let mut mean = 0.0;
-                    for (key, weight) in weights.iter().enumerate() {
-                        let d_weight = math::dot(d_out, &values.row(key)[head..head + head_dim]);
-                        mean += weight * d_weight;
-                        d_scores.push(d_weight);
-                    }
-                    let d_scores = &mut d_scores[query * keys.rows..];
+                let (keys, values) = (keys.columns(head.clone()), values.columns(head.clone()));
+                let (queries, d_out) = (queries.columns(head.clone()), d_out.columns(head.clone()));
+                dots(d_out, values, d_scores);
+                for (d_scores, weights) in
+                    d_scores.chunks_exact_mut(keys.rows).zip(weights_here.chunks_exact(keys.rows))
+                {
+                    let mean: f32 = weights.iter().zip(&*d_scores).fold(0.0, |sum, (w, d)| sum + w * d);
                     for (d_score, weight) in d_scores.iter_mut().zip(weights) {
                         *d_score = weight * (*d_score - mean) * scale(head_dim);
                     }
-                    for_lanes!(head..head + head_dim, |at, len| {
-                        let d_query = weighted_sum(d_scores, 1, keys, at, len);
-                        store(d_query, &mut d_queries[query * a..][..a], at, len);
-                    });
                 }
-                for key in 0..keys.rows {
-                    let d_key_value = &mut d_key_values[key * 2 * a..][..2 * a];
-                    for_lanes!(head..head + head_dim, |at, len| {
-                        let d_key = weighted_sum(&d_scores[key..], keys.rows, queries, at, len);
-                        store(d_key, d_key_value, at, len);
-                        let d_value = weighted_sum(&weights_here[key..], keys.rows, d_out, at, len);
-                        let value = load(values.row(key), at, len);
-                        let d_value = each(|lane| if value[lane] > 0.0 { d_value[lane] } else { 0.0 });
-                        store(d_value, d_key_value, a + at, len);
-                    });
+                blend(d_scores, keys, ViewMut::dense(d_queries, a).columns(head.clone()));
+                let d_keys = ViewMut::dense(d_key_values, 2 * a).columns(head.clone());
+                blend_transposed(d_scores, queries, d_keys);
+                let mut d_values =
+                    ViewMut::dense(d_key_values, 2 * a).columns(a + head.start..a + head.end);
+                blend_transposed(weights_here, d_out, d_values.reborrow());
+                for key in 0..values.rows {
+                    for (d_value, value) in d_values.row(key).iter_mut().zip(values.row(key)) {
+                        *d_value = if *value > 0.0 { *d_value } else { 0.0 };
+                    }
                 }
             }
         }
@@ -282,6 +274,57 @@ fn keys_and_values<'a>(key_values: &'a [f32], group: &Group, a: usize) -> (View<
     let both = View { data: key_values, rows: key_values.len() / (2 * a), cols: 2 * a, stride: 2 * a };
     let both = both.rows(group.keys.clone());
     (both.columns(0..a), both.columns(a..2 * a))
+}
+
+/// Each head's columns.
+#[inline(always)]
+fn heads(a: usize, head_dim: usize) -> impl Iterator<Item = Range<usize>> {
+    (0..a).step_by(head_dim).map(move |at| at..at + head_dim)
+}
+
+/// Queries from which on a group's products are faer's: to smaller ones the call costs more than the loops here.
+const LARGE: usize = 8;
+
+/// pairs = a bᵀ. `a` (queries, c), `b` (keys, c), `pairs` `[queries, keys]`.
+#[inline(always)]
+fn dots(a: View<'_>, b: View<'_>, pairs: &mut [f32]) {
+    if a.rows >= LARGE {
+        return matmul::x_wt(a, b, ViewMut::dense(pairs, b.rows), Accum::Replace);
+    }
+    for (query, pairs) in pairs.chunks_exact_mut(b.rows).enumerate() {
+        for (key, pair) in pairs.iter_mut().enumerate() {
+            *pair = math::dot(a.row(query), b.row(key));
+        }
+    }
+}
+
+/// a = pairs b. `pairs` `[queries, keys]`, `b` (keys, c), `a` (queries, c).
+#[inline(always)]
+fn blend(pairs: &[f32], b: View<'_>, mut a: ViewMut<'_>) {
+    if a.rows >= LARGE {
+        return matmul::dy_w(View::dense(pairs, b.rows), b, a, Accum::Replace);
+    }
+    for (query, weights) in pairs.chunks_exact(b.rows).enumerate() {
+        let a = a.row(query);
+        for_lanes!(0..b.cols, |at, len| {
+            store(weighted_sum(weights, 1, b, at, len), a, at, len);
+        });
+    }
+}
+
+/// b = pairsᵀ a. `pairs` `[queries, keys]`, `a` (queries, c), `b` (keys, c).
+#[inline(always)]
+fn blend_transposed(pairs: &[f32], a: View<'_>, mut b: ViewMut<'_>) {
+    if a.rows >= LARGE {
+        return matmul::dyt_x(View::dense(pairs, b.rows), a, b, Accum::Replace);
+    }
+    let keys = b.rows;
+    for key in 0..keys {
+        let b = b.row(key);
+        for_lanes!(0..a.cols, |at, len| {
+            store(weighted_sum(&pairs[key..], keys, a, at, len), b, at, len);
+        });
+    }
 }
 
 /// Σ weights[i · stride] · row i, in the `len` columns from `at` on.
@@ -319,153 +362,4 @@ impl<'a> Visible<'a> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::gradcheck::{check, noise};
-
-    const INPUTS: usize = 5;
-    const DIM: usize = 6;
-    /// Two groups: 2 queries over 3 keys, then 1 query over 2 keys. Query 1 does not see key 0, query 2 none.
-    const SEEN: [u8; 8] = [1, 1, 1, 0, 1, 1, 0, 0];
-
-    fn groups() -> [Group; 2] {
-        [Group { queries: 0..2, keys: 0..3 }, Group { queries: 2..3, keys: 3..5 }]
-    }
-
-    fn unit(heads: usize) -> (Attention, usize) {
-        let mut layout = LayoutBuilder::default();
-        let attention = Attention::new(&mut layout, "attention", INPUTS, DIM, heads);
-        (attention, layout.len())
-    }
-
-    fn run(
-        attention: &Attention,
-        params: &[f32],
-        xq: &[f32],
-        xk: &[f32],
-        visible: Visible<'_>,
-    ) -> (Vec<f32>, AttentionState) {
-        let (mut out, mut state) = (vec![9.0; 3 * DIM], AttentionState::default());
-        let (xq, xk) = (View::dense(xq, INPUTS), View::dense(xk, INPUTS));
-        attention.project(params, xq, xk, &mut state);
-        attention.attend(&groups(), visible, &mut state, ViewMut::dense(&mut out, DIM));
-        (out, state)
-    }
-
-    /// Equations 12-14, one number at a time.
-    fn reference(attention: &Attention, params: &[f32], xq: &[f32], xk: &[f32], seen: &[u8]) -> Vec<f32> {
-        let project = |linear: &Linear, x: &[f32]| -> Vec<f32> {
-            let mut y = vec![0.0; x.len() / INPUTS * linear.outputs];
-            linear.forward(params, View::dense(x, INPUTS), ViewMut::dense(&mut y, linear.outputs));
-            y
-        };
-        let (q, kv) = (project(&attention.query, xq), project(&attention.key_value, xk));
-        let head_dim = DIM / attention.heads;
-        let mut out = vec![0.0; 3 * DIM];
-        let mut at = 0;
-        for group in groups() {
-            for query in group.queries.clone() {
-                let flags = &seen[at..at + group.keys.len()];
-                at += group.keys.len();
-                for column in 0..DIM {
-                    let head = column / head_dim * head_dim..(column / head_dim + 1) * head_dim;
-                    let weight = |key: usize| -> f32 {
-                        let score: f32 =
-                            head.clone().map(|c| q[query * DIM + c] * kv[key * 2 * DIM + c]).sum();
-                        (score / (head_dim as f32).sqrt()).exp()
-                    };
-                    let keys =
-                        || group.keys.clone().zip(flags).filter(|(_, seen)| **seen == 1).map(|(key, _)| key);
-                    let total: f32 = keys().map(weight).sum();
-                    let sum: f32 =
-                        keys().map(|key| weight(key) * kv[key * 2 * DIM + DIM + column].max(0.0)).sum();
-                    out[query * DIM + column] = if total > 0.0 { sum / total } else { 0.0 };
-                }
-            }
-        }
-        out
-    }
-
-    #[test]
-    fn follows_the_equations_with_any_number_of_heads() {
-        for heads in [1, 2, 3] {
-            let (attention, len) = unit(heads);
-            let (params, xq, xk) = (noise(1, len), noise(2, 3 * INPUTS), noise(3, 5 * INPUTS));
-            for (visible, seen) in [(Visible::All, [1; 8]), (Visible::Where(&SEEN), SEEN)] {
-                let (out, _) = run(&attention, &params, &xq, &xk, visible);
-                for (a, b) in out.iter().zip(reference(&attention, &params, &xq, &xk, &seen)) {
-                    assert!((a - b).abs() < 1e-5, "{heads} heads: {a} {b}");
-                }
-            }
-        }
-    }
-
-    /// Gradients of queries, keys and parameters. The first two are written over, whatever lay there.
-    fn backward(
-        attention: &Attention,
-        params: &[f32],
-        xq: &[f32],
-        xk: &[f32],
-        state: &AttentionState,
-        d_out: &[f32],
-    ) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
-        let (mut dxq, mut dxk, mut grads) =
-            (vec![9.0; xq.len()], vec![9.0; xk.len()], vec![0.0; params.len()]);
-        attention.backward(
-            params,
-            View::dense(xq, INPUTS),
-            View::dense(xk, INPUTS),
-            &groups(),
-            state,
-            View::dense(d_out, DIM),
-            ViewMut::dense(&mut dxq, INPUTS),
-            ViewMut::dense(&mut dxk, INPUTS),
-            &mut grads,
-            &mut Scratch::default(),
-        );
-        (dxq, dxk, grads)
-    }
-
-    #[test]
-    fn who_sees_nothing_gets_exactly_zero_and_passes_no_gradient() {
-        let (attention, len) = unit(2);
-        let (params, xq, xk) = (noise(1, len), noise(2, 3 * INPUTS), noise(3, 5 * INPUTS));
-        let (out, state) = run(&attention, &params, &xq, &xk, Visible::Where(&SEEN));
-        assert_eq!(out[2 * DIM..], [0.0; DIM]);
-        let (dxq, dxk, _) = backward(&attention, &params, &xq, &xk, &state, &noise(4, 3 * DIM));
-        assert_eq!(dxq[2 * INPUTS..], [0.0; INPUTS]);
-        assert_eq!(dxk[3 * INPUTS..], [0.0; 2 * INPUTS]);
-    }
-
-    /// Weights as those of trained networks, which are sure of where to look: what else there is gets exactly nothing,
-    /// and no gradient of it is subnormal.
-    #[test]
-    fn what_weighs_next_to_nothing_weighs_nothing() {
-        let (attention, len) = unit(1);
-        let large = |seed, len| -> Vec<f32> { noise(seed, len).iter().map(|x| 12.0 * x).collect() };
-        let (params, xq, xk) = (large(1, len), large(2, 3 * INPUTS), large(3, 5 * INPUTS));
-        let (_, state) = run(&attention, &params, &xq, &xk, Visible::All);
-        assert!(state.weights.contains(&0.0) && state.weights.iter().all(|&w| w == 0.0 || w > 1e-21));
-        let d_out: Vec<f32> = noise(4, 3 * DIM).iter().map(|d| 1e-6 * d).collect();
-        let (dxq, dxk, grads) = backward(&attention, &params, &xq, &xk, &state, &d_out);
-        assert!([dxq, dxk, grads].concat().iter().all(|d| !d.is_subnormal()));
-    }
-
-    #[test]
-    fn gradients_are_the_numeric_ones() {
-        for (heads, visible) in [(1, Visible::All), (2, Visible::Where(&SEEN)), (3, Visible::All)] {
-            let (attention, len) = unit(heads);
-            let (params, xq, xk, to) =
-                (noise(1, len), noise(2, 3 * INPUTS), noise(3, 5 * INPUTS), noise(4, 3 * DIM));
-            let loss = |params: &[f32], xq: &[f32], xk: &[f32]| {
-                let (out, _) = run(&attention, params, xq, xk, visible);
-                out.iter().zip(&to).map(|(out, to)| f64::from(out * to)).sum()
-            };
-            let (_, state) = run(&attention, &params, &xq, &xk, visible);
-            let (dxq, dxk, grads) = backward(&attention, &params, &xq, &xk, &state, &to);
-            check("params", &params, &grads, |params| loss(params, &xq, &xk));
-            check("queries", &xq, &dxq, |xq| loss(&params, xq, &xk));
-            check("keys", &xk, &dxk, |xk| loss(&params, &xq, xk));
-        }
-    }
-}
+mod tests;
