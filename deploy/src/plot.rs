@@ -2,11 +2,13 @@
 
 use crate::{cli::PlotOptions, failure::Failure};
 use plotters::{
+    coord::Shift,
     prelude::{
-        ChartBuilder, Color as _, IntoDrawingArea as _, IntoFont as _, LineSeries, PathElement, Polygon,
-        RGBColor, SVGBackend, WHITE,
+        ChartBuilder, Color as _, DrawingArea, IntoDrawingArea as _, IntoFont as _, LineSeries, PathElement,
+        Polygon, RGBColor, SVGBackend, TextStyle, WHITE,
     },
     series::DashedLineSeries,
+    style::text_anchor::{HPos, Pos, VPos},
 };
 use serde_json::Value;
 use std::{
@@ -29,6 +31,8 @@ const COLOURS: [RGBColor; 6] = [
     RGBColor(230, 159, 0),
     RGBColor(86, 180, 233),
 ];
+
+type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 
 /// Means of one task over runs, by environment steps: lowest, mean, highest.
 type Curve = Vec<(f64, [f64; 3])>;
@@ -110,8 +114,9 @@ fn draw(curves: &BTreeMap<String, Curve>, options: &PlotOptions) -> Result<Strin
     {
         let area = SVGBackend::with_string(&mut text, SIZE).into_drawing_area();
         area.fill(&WHITE)?;
-        let mut chart = ChartBuilder::on(&area)
-            .caption(&options.title, ("sans-serif", 20).into_font())
+        let below_title = area.margin(8, 0, 0, 0).titled(&options.title, ("sans-serif", 20))?;
+        let chart_area = draw_legend(&below_title, curves.keys())?;
+        let mut chart = ChartBuilder::on(&chart_area)
             .margin(12)
             .x_label_area_size(44)
             .y_label_area_size(64)
@@ -123,29 +128,45 @@ fn draw(curves: &BTreeMap<String, Curve>, options: &PlotOptions) -> Result<Strin
             .y_desc("mean return, greedy")
             .label_style(("sans-serif", 14))
             .draw()?;
-        for ((task, curve), colour) in curves.iter().zip(COLOURS.iter().cycle()) {
+        for (curve, colour) in curves.values().zip(COLOURS.iter().cycle()) {
             let at = |which: usize| curve.iter().map(move |(steps, values)| (steps / 1e6, values[which]));
             let band: Vec<(f64, f64)> = at(0).chain(at(2).collect::<Vec<_>>().into_iter().rev()).collect();
             chart.draw_series(std::iter::once(Polygon::new(band, colour.mix(0.15))))?;
-            chart
-                .draw_series(LineSeries::new(at(1), colour.stroke_width(2)))?
-                .label(task)
-                .legend(|(x, y)| PathElement::new([(x, y), (x + 18, y)], colour.stroke_width(2)));
+            chart.draw_series(LineSeries::new(at(1), colour.stroke_width(2)))?;
         }
         if let Some(line) = options.line {
             let ends = [(0.0, line), (steps_max / 1e6, line)];
             let grey = RGBColor(110, 110, 110);
             chart.draw_series(DashedLineSeries::new(ends, 6, 4, grey.stroke_width(1)))?;
         }
-        chart
-            .configure_series_labels()
-            .label_font(("sans-serif", 14))
-            .background_style(WHITE.mix(0.8))
-            .border_style(RGBColor(200, 200, 200))
-            .draw()?;
         area.present()?;
     }
     Ok(text)
+}
+
+/// Writes the tasks in their colours above the chart, where no curve is hidden by them, in as many lines as that takes;
+/// returns the area that is left.
+fn draw_legend<'a>(
+    area: &Area<'a>,
+    tasks: impl Iterator<Item = &'a String>,
+) -> Result<Area<'a>, Box<dyn Error>> {
+    const LEFT: i32 = 76;
+    const GAP: i32 = 20;
+    const DASH: i32 = 18;
+    const LINE: i32 = 20;
+    let right = area.dim_in_pixel().0 as i32;
+    let (mut x, mut y) = (LEFT, LINE / 2);
+    for (task, colour) in tasks.zip(COLOURS.iter().cycle()) {
+        let text = TextStyle::from(("sans-serif", 14).into_font()).pos(Pos::new(HPos::Left, VPos::Center));
+        let width = DASH + 6 + area.estimate_text_size(task, &text)?.0 as i32;
+        if x > LEFT && x + width > right {
+            (x, y) = (LEFT, y + LINE);
+        }
+        area.draw(&PathElement::new([(x, y), (x + DASH, y)], colour.stroke_width(2)))?;
+        area.draw_text(task, &text, (x + DASH + 6, y))?;
+        x += width + GAP;
+    }
+    Ok(area.split_vertically(y + LINE / 2).1)
 }
 
 #[cfg(test)]
@@ -158,5 +179,25 @@ mod tests {
         let runs = [run(&[(0, 1.0), (10, 2.0), (20, 3.0)]), run(&[(0, 3.0), (10, 6.0)])];
         let expected: Curve = vec![(0.0, [1.0, 2.0, 3.0]), (10.0, [2.0, 4.0, 6.0])];
         assert_eq!(curves(&runs)["a"], expected);
+    }
+
+    #[test]
+    fn the_legend_takes_as_many_lines_as_the_tasks_need() {
+        let tasks =
+            (0..12).map(|i| (format!("predator-prey-pro-{i:02}-2"), vec![(0.0, [1.0; 3]), (5.0, [2.0; 3])]));
+        let options = PlotOptions { runs: Vec::new(), out: PathBuf::new(), title: "all".into(), line: None };
+        let svg = draw(&tasks.clone().collect(), &options).unwrap();
+        let place = |name: &str| {
+            let text = &svg[..svg.find(name).unwrap()];
+            let number = |key: &str| {
+                let at = text.rfind(key).unwrap() + key.len();
+                text[at..].split('"').next().unwrap().parse::<i32>().unwrap()
+            };
+            (number(" y=\""), number(" x=\""))
+        };
+        let places: Vec<_> = tasks.map(|(name, _)| place(&name)).collect();
+        assert!(places.is_sorted_by(|a, b| a < b), "one after another: {places:?}");
+        assert!(places.iter().all(|(_, x)| *x < 800), "within the picture: {places:?}");
+        assert!(places.last().unwrap().0 > places[0].0, "several lines: {places:?}");
     }
 }
