@@ -215,9 +215,32 @@ pub async fn connect(address: &Address, credentials: &Credentials) -> Result<Cli
     if let (Some(tls), Address::Tcp { host, .. }) = (tls, address) {
         endpoint = endpoint.tls_config(tls.clone().domain_name(host)).map_err(no_answer)?;
     }
-    let channel = endpoint.connect().await.map_err(no_answer)?;
-    let client = InterceptedService::new(channel, EveryCall { token: token.clone() });
-    // With TLS 1.3 a learner refuses a certificate after the handshake, as far as the caller can tell.
+    let mut attempts = if tls.is_some() { TLS_ATTEMPTS } else { 1 };
+    loop {
+        attempts -= 1;
+        match greet(address, &endpoint, token.as_ref()).await {
+            Err(ConnectError::NoAnswer { reason, .. }) if reason == REASON_LOST && attempts > 0 => {}
+            outcome => return outcome,
+        }
+    }
+}
+
+/// How often a connection is made at most whose end does not say why.
+const TLS_ATTEMPTS: usize = 20;
+
+/// What hyper says of a call on a connection that failed just before: the connection's own error, which has the
+/// reason, is nowhere to be had then.
+const REASON_LOST: &str = "connection closed";
+
+/// Connects, and makes a first call. With TLS 1.3 a learner refuses a certificate after the handshake, as far as the
+/// caller can tell: the refusal meets the call, or comes just before it, and then its reason is lost.
+async fn greet(
+    address: &Address,
+    endpoint: &Endpoint,
+    token: Option<&MetadataValue<Ascii>>,
+) -> Result<Client, ConnectError> {
+    let channel = endpoint.connect().await.map_err(|error| why(address, &error))?;
+    let client = InterceptedService::new(channel, EveryCall { token: token.cloned() });
     let greeting = HealthClient::new(client.clone()).check(HealthCheckRequest::default()).await;
     match greeting {
         Ok(_) => Ok(client),
