@@ -1,7 +1,7 @@
 //! What callers must show before a learner listens to them.
 
 use super::{
-    Address,
+    ALPN_HTTP2, Address,
     files::{FileError, read_authorities, read_certificates, read_key, read_token},
 };
 use std::{fmt, path::PathBuf, sync::Arc};
@@ -15,9 +15,6 @@ use tokio_rustls::{
     },
 };
 use tonic::{Request, Status, service::Interceptor};
-
-/// What HTTP/2 is called in a TLS handshake.
-const ALPN_HTTP2: &[u8] = b"h2";
 
 /// The files that say who may call over TCP.
 #[derive(Clone, Debug, Default)]
@@ -111,13 +108,13 @@ impl Access {
             ServerConfig::builder_with_provider(Arc::clone(&provider)).with_protocol_versions(&[&TLS13])?;
         let config = match client_ca {
             Some(path) => {
-                let authorities = Arc::new(read_authorities(path)?.1);
+                let authorities = Arc::new(read_authorities(path)?);
                 let verifier = WebPkiClientVerifier::builder_with_provider(authorities, provider).build()?;
                 config.with_client_cert_verifier(verifier)
             }
             None => config.with_no_client_auth(),
         };
-        let mut config = config.with_single_cert(read_certificates(certificate)?.1, read_key(key)?.1)?;
+        let mut config = config.with_single_cert(read_certificates(certificate)?, read_key(key)?)?;
         config.alpn_protocols = vec![ALPN_HTTP2.to_vec()];
         Ok(Self { token, tls: Some(TlsAcceptor::from(Arc::new(config))) })
     }

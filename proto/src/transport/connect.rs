@@ -1,17 +1,29 @@
 //! Connecting to a learner.
 
 use super::{
-    Address, CALL_TIMEOUT, CONNECT_TIMEOUT, KEEPALIVE_EVERY, KEEPALIVE_TIMEOUT, LONG_CALL_TIMEOUT,
+    ALPN_HTTP2, Address, CALL_TIMEOUT, CONNECT_TIMEOUT, KEEPALIVE_EVERY, KEEPALIVE_TIMEOUT,
+    LONG_CALL_TIMEOUT,
     files::{FileError, read_authorities, read_certificates, read_key, read_token},
 };
-use std::{error::Error, fmt, path::PathBuf, time::Duration};
+use hyper_util::rt::TokioIo;
+use std::{error::Error, fmt, io, path::PathBuf, sync::Arc, time::Duration};
+use tokio::{
+    io::{AsyncBufReadExt as _, BufReader},
+    net::TcpStream,
+};
+use tokio_rustls::{
+    TlsConnector,
+    client::TlsStream,
+    rustls::{self, ClientConfig, crypto::ring, pki_types::ServerName, version::TLS13},
+};
 use tonic::{
     Code, GrpcMethod, Request, Status,
     metadata::{Ascii, MetadataValue},
     service::{Interceptor, interceptor::InterceptedService},
-    transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity},
+    transport::{Channel, Endpoint},
 };
 use tonic_health::pb::{HealthCheckRequest, health_client::HealthClient};
+use tower::service_fn;
 
 /// The files that a caller shows what they hold of.
 #[derive(Clone, Debug, Default)]
@@ -35,13 +47,16 @@ pub enum CredentialsError {
     /// A file cannot be used.
     #[error(transparent)]
     File(#[from] FileError),
+    /// Key and certificate do not belong together, or cannot be used.
+    #[error("--tls-certificate and --tls-key: {0}")]
+    Tls(#[from] rustls::Error),
 }
 
 /// What a caller shows.
 #[derive(Clone, Default)]
 pub struct Credentials {
     token: Option<MetadataValue<Ascii>>,
-    tls: Option<ClientTlsConfig>,
+    tls: Option<TlsConnector>,
 }
 
 impl fmt::Debug for Credentials {
@@ -73,25 +88,27 @@ impl Credentials {
         let CredentialFiles { token, ca, certificate, key } = files;
         let token = token.as_deref().map(read_token).transpose()?;
         let identity = match (certificate, key) {
-            (Some(certificate), Some(key)) => {
-                Some(Identity::from_pem(read_certificates(certificate)?.0, read_key(key)?.0))
-            }
+            (Some(certificate), Some(key)) => Some((read_certificates(certificate)?, read_key(key)?)),
             (None, None) => None,
             (Some(_), None) => return Err(CredentialsError::Incomplete("key")),
             (None, Some(_)) => return Err(CredentialsError::Incomplete("certificate")),
         };
-        let tls = match ca {
-            Some(ca) => {
-                let config =
-                    ClientTlsConfig::new().ca_certificate(Certificate::from_pem(read_authorities(ca)?.0));
-                Some(match identity {
-                    Some(identity) => config.identity(identity),
-                    None => config,
-                })
-            }
-            None if identity.is_some() => return Err(CredentialsError::Incomplete("ca")),
-            None => None,
+        let Some(ca) = ca else {
+            return match identity {
+                Some(_) => Err(CredentialsError::Incomplete("ca")),
+                None => Ok(token.map_or_else(Self::default, |token| Self::token(&token))),
+            };
         };
+        // Both ends are this program: nothing older is ever needed.
+        let config = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()))
+            .with_protocol_versions(&[&TLS13])?
+            .with_root_certificates(read_authorities(ca)?);
+        let mut config = match identity {
+            Some((certificates, key)) => config.with_client_auth_cert(certificates, key)?,
+            None => config.with_no_client_auth(),
+        };
+        config.alpn_protocols = vec![ALPN_HTTP2.to_vec()];
+        let tls = Some(TlsConnector::from(Arc::new(config)));
         Ok(Self { tls, ..token.map_or_else(Self::default, |token| Self::token(&token)) })
     }
 }
@@ -199,48 +216,26 @@ pub async fn connect(address: &Address, credentials: &Credentials) -> Result<Cli
     }
     let uri = match address {
         Address::Unix(path) => format!("unix:{}", path.display()),
-        Address::Tcp { .. } => {
-            let scheme = if tls.is_some() { "https" } else { "http" };
-            address.to_string().replacen("tcp:", &format!("{scheme}://"), 1)
-        }
+        // With TLS too: the connector sees to that.
+        Address::Tcp { .. } => address.to_string().replacen("tcp:", "http://", 1),
     };
     let no_answer = |error: tonic::transport::Error| why(address, &error);
-    let mut endpoint = Endpoint::try_from(uri)
+    let endpoint = Endpoint::try_from(uri)
         .map_err(no_answer)?
         .connect_timeout(CONNECT_TIMEOUT)
         .tcp_nodelay(true)
         .http2_keep_alive_interval(KEEPALIVE_EVERY)
         .keep_alive_timeout(KEEPALIVE_TIMEOUT)
         .keep_alive_while_idle(true);
-    if let (Some(tls), Address::Tcp { host, .. }) = (tls, address) {
-        endpoint = endpoint.tls_config(tls.clone().domain_name(host)).map_err(no_answer)?;
-    }
-    let mut attempts = if tls.is_some() { TLS_ATTEMPTS } else { 1 };
-    loop {
-        attempts -= 1;
-        match greet(address, &endpoint, token.as_ref()).await {
-            Err(ConnectError::NoAnswer { reason, .. }) if reason == REASON_LOST && attempts > 0 => {}
-            outcome => return outcome,
+    let channel = match (tls, address) {
+        (Some(tls), Address::Tcp { host, port }) => {
+            let (tls, host, port) = (tls.clone(), host.clone(), *port);
+            let connector = service_fn(move |_| connect_tls(tls.clone(), host.clone(), port));
+            endpoint.connect_with_connector(connector).await
         }
-    }
-}
-
-/// How often a connection is made at most whose end does not say why.
-const TLS_ATTEMPTS: usize = 20;
-
-/// What hyper says of a call on a connection that failed just before: the connection's own error, which has the
-/// reason, is nowhere to be had then.
-const REASON_LOST: &str = "connection closed";
-
-/// Connects, and makes a first call. With TLS 1.3 a learner refuses a certificate after the handshake, as far as the
-/// caller can tell: the refusal meets the call, or comes just before it, and then its reason is lost.
-async fn greet(
-    address: &Address,
-    endpoint: &Endpoint,
-    token: Option<&MetadataValue<Ascii>>,
-) -> Result<Client, ConnectError> {
-    let channel = endpoint.connect().await.map_err(|error| why(address, &error))?;
-    let client = InterceptedService::new(channel, EveryCall { token: token.cloned() });
+        _ => endpoint.connect().await,
+    };
+    let client = InterceptedService::new(channel.map_err(no_answer)?, EveryCall { token: token.clone() });
     let greeting = HealthClient::new(client.clone()).check(HealthCheckRequest::default()).await;
     match greeting {
         Ok(_) => Ok(client),
@@ -252,6 +247,24 @@ async fn greet(
             _ => why(address, &status),
         }),
     }
+}
+
+/// A connection with TLS on which the learner has said its first word: HTTP/2's settings, which it sends unasked. With
+/// TLS 1.3 a caller's handshake ends before the learner has seen its certificate; a refusal comes in place of the
+/// settings, and would be lost if it ended a connection on which no call is under way.
+async fn connect_tls(
+    tls: TlsConnector,
+    host: String,
+    port: u16,
+) -> io::Result<TokioIo<BufReader<TlsStream<TcpStream>>>> {
+    let stream = TcpStream::connect((host.as_str(), port)).await?;
+    stream.set_nodelay(true)?;
+    let name = ServerName::try_from(host).map_err(io::Error::other)?;
+    let mut stream = BufReader::new(tls.connect(name, stream).await?);
+    if stream.fill_buf().await?.is_empty() {
+        return Err(io::ErrorKind::UnexpectedEof.into());
+    }
+    Ok(TokioIo::new(stream))
 }
 
 /// What a failed connection comes down to.

@@ -93,31 +93,28 @@ pub(super) fn read_token(path: &Path) -> Result<String, FileError> {
     Ok(token)
 }
 
-/// A certificate and those that lead to its authority, as PEM and parsed.
-pub(super) fn read_certificates(path: &Path) -> Result<(Vec<u8>, Vec<CertificateDer<'static>>), FileError> {
+/// A certificate and those that lead to its authority.
+pub(super) fn read_certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, FileError> {
     let pem = read(path, |_| Ok(()))?;
     let certificates: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(&pem).collect();
     match certificates {
-        Ok(certificates) if !certificates.is_empty() => Ok((pem, certificates)),
+        Ok(certificates) if !certificates.is_empty() => Ok(certificates),
         _ => Err(FileError::NotPem { path: path.to_owned(), what: "certificate" }),
     }
 }
 
-/// A private key in a file of this user alone, as PEM and parsed.
-pub(super) fn read_key(path: &Path) -> Result<(Vec<u8>, PrivateKeyDer<'static>), FileError> {
-    let pem = read_private(path)?;
+/// A private key in a file of this user alone.
+pub(super) fn read_key(path: &Path) -> Result<PrivateKeyDer<'static>, FileError> {
     let not_pem = |_| FileError::NotPem { path: path.to_owned(), what: "private key" };
-    let key = PrivateKeyDer::from_pem_slice(&pem).map_err(not_pem)?;
-    Ok((pem, key))
+    PrivateKeyDer::from_pem_slice(&read_private(path)?).map_err(not_pem)
 }
 
-/// The certificates of authorities, as PEM and parsed.
-pub(super) fn read_authorities(path: &Path) -> Result<(Vec<u8>, RootCertStore), FileError> {
-    let (pem, certificates) = read_certificates(path)?;
+/// The certificates of authorities.
+pub(super) fn read_authorities(path: &Path) -> Result<RootCertStore, FileError> {
     let mut authorities = RootCertStore::empty();
-    for certificate in certificates {
+    for certificate in read_certificates(path)? {
         let not_pem = |_| FileError::NotPem { path: path.to_owned(), what: "authority's certificate" };
         authorities.add(certificate).map_err(not_pem)?;
     }
-    Ok((pem, authorities))
+    Ok(authorities)
 }

@@ -28,6 +28,9 @@ pub use serve::{CONNECTIONS_MAX, REQUEST_BYTES_MAX, ServeLimits, serve};
 
 use std::time::Duration;
 
+/// What HTTP/2 is called in a TLS handshake.
+const ALPN_HTTP2: &[u8] = b"h2";
+
 /// How long connecting, and greeting whoever connects, may take.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 
