@@ -32,6 +32,10 @@ const COLOURS: [RGBColor; 6] = [
     RGBColor(86, 180, 233),
 ];
 
+/// Around the chart, and for the labels of its vertical axis, in pixels.
+const MARGIN: i32 = 12;
+const Y_LABELS: i32 = 64;
+
 type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 
 /// Means of one task over runs, by environment steps: lowest, mean, highest.
@@ -117,9 +121,9 @@ fn draw(curves: &BTreeMap<String, Curve>, options: &PlotOptions) -> Result<Strin
         let below_title = area.margin(8, 0, 0, 0).titled(&options.title, ("sans-serif", 20))?;
         let chart_area = draw_legend(&below_title, curves.keys())?;
         let mut chart = ChartBuilder::on(&chart_area)
-            .margin(12)
+            .margin(MARGIN)
             .x_label_area_size(44)
-            .y_label_area_size(64)
+            .y_label_area_size(Y_LABELS)
             .build_cartesian_2d(0.0..steps_max / 1e6, bottom - margin..top + margin)?;
         chart
             .configure_mesh()
@@ -150,7 +154,7 @@ fn draw_legend<'a>(
     area: &Area<'a>,
     tasks: impl Iterator<Item = &'a String>,
 ) -> Result<Area<'a>, Box<dyn Error>> {
-    const LEFT: i32 = 76;
+    const LEFT: i32 = MARGIN + Y_LABELS;
     const GAP: i32 = 20;
     const DASH: i32 = 18;
     const LINE: i32 = 20;

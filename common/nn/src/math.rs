@@ -218,6 +218,17 @@ mod tests {
     }
 
     #[test]
+    fn a_negligible_share_is_exactly_zero() {
+        for x in [-46.06, -80.0, -1e9, f32::NEG_INFINITY] {
+            assert_eq!(exp_share(x), 0.0, "{x}");
+        }
+        for x in [0.0, -1.0, -46.0] {
+            assert_eq!(exp_share(x), exp(x), "{x}");
+            assert!(exp_share(x) > 0.0, "{x}");
+        }
+    }
+
+    #[test]
     fn dispatch_changes_no_bit() {
         let xs: Vec<f32> = (0..1000).map(|i| (i as f32 - 500.0) * 0.037).collect();
         let plain: Vec<f32> = xs.iter().map(|&x| exp(x) + tanh(x)).collect();

@@ -265,6 +265,9 @@ fn a_caller_needs_all_that_belongs_together() {
     assert_eq!(missing(&ca, &certificate, &None).unwrap(), "--tls-key");
     assert_eq!(missing(&ca, &None, &key).unwrap(), "--tls-certificate");
     assert_eq!(missing(&None, &certificate, &key).unwrap(), "--tls-ca");
+    let other = Some(pki.identity("other", &authority, "client", false).key);
+    let unfit = CredentialFiles { token: None, ca, certificate, key: other };
+    assert!(matches!(Credentials::read(&unfit), Err(CredentialsError::Tls(_))));
 }
 
 // Many times and on several threads: whichever of them hears a refusal first, it is told as what it is.
