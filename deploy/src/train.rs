@@ -190,11 +190,8 @@ impl Run<'_> {
         status: ExitStatus,
         config: &Config,
     ) -> Result<ControlClient<Client>, Failure> {
-        self.progress.say(&format!("the learner {} and is restarted", in_words(status)));
-        // Else the dead one's address would be taken for the new one's.
-        let _ = fs::remove_file(self.run_dir.address());
+        self.start_again(learner, status)?;
         loop {
-            learner.restart()?;
             match self.control(learner).await {
                 Ok(control) => {
                     self.start_actors(config.actors.count)?;
@@ -207,7 +204,16 @@ impl Run<'_> {
                     remove_shared_memory(self.run_dir);
                 }
             }
+            learner.restart()?;
         }
+    }
+
+    /// Starts a learner again that something from outside has ended.
+    fn start_again(&mut self, learner: &mut Process, status: ExitStatus) -> Result<(), Failure> {
+        self.progress.say(&format!("the learner {} and is restarted", in_words(status)));
+        // Else the dead one's address would be taken for the new one's.
+        let _ = fs::remove_file(self.run_dir.address());
+        learner.restart()
     }
 
     /// A hung actor is of no use; when it is dead it is restarted like any other.
@@ -228,31 +234,45 @@ impl Run<'_> {
         Process::start(name, command, &self.run_dir.logs(), self.logs)
     }
 
-    /// Waits until the learner listens.
+    /// Waits until the learner answers. One that is killed before it does is started again: connecting to it fails
+    /// then, and its end is known a moment later.
     async fn control(&mut self, learner: &mut Process) -> Result<ControlClient<Client>, Failure> {
-        let listening = async {
-            loop {
-                if self.run_dir.address().exists() {
-                    return;
+        loop {
+            let mut unheard = None;
+            let answering = async {
+                loop {
+                    if self.run_dir.address().exists() {
+                        match control::connect(self.run_dir).await {
+                            Ok(control) => return control,
+                            Err(failure) => unheard = Some(failure),
+                        }
+                    }
+                    tokio::time::sleep(START_POLL).await;
                 }
-                tokio::time::sleep(START_POLL).await;
-            }
-        };
-        tokio::select! {
-            () = listening => {}
-            status = learner.wait() => return Err(died(learner, status.map_err(Failure::runtime)?)),
-            () = tokio::time::sleep(START_TIMEOUT) => {
-                learner.end().await;
-                let seconds = START_TIMEOUT.as_secs();
-                return Err(Failure::runtime_message(format!(
-                    "the learner does not listen after {seconds} s: {} (log: {})",
-                    learner.last_words(),
-                    learner.log().display()
-                )));
+            };
+            tokio::select! {
+                control = answering => {
+                    self.say_web_url();
+                    return Ok(control);
+                }
+                status = learner.wait() => {
+                    let status = status.map_err(Failure::runtime)?;
+                    if status.code().is_some() {
+                        return Err(died(learner, status));
+                    }
+                    self.start_again(learner, status)?;
+                }
+                () = tokio::time::sleep(START_TIMEOUT) => {
+                    learner.end().await;
+                    let why = unheard.map_or_else(|| learner.last_words(), |failure| failure.to_string());
+                    return Err(Failure::runtime_message(format!(
+                        "the learner does not answer after {} s: {why} (log: {})",
+                        START_TIMEOUT.as_secs(),
+                        learner.log().display()
+                    )));
+                }
             }
         }
-        self.say_web_url();
-        control::connect(self.run_dir).await
     }
 
     /// Says where the web page is, when it is there first and when it moves.
