@@ -14,7 +14,7 @@
 use crate::Rows;
 use faer::Accum;
 use rit_nn::{
-    Attention, LayoutBuilder, Linear, Scratch, View, ViewMut, activation, fit, linear, math, matmul,
+    Attention, Buffer, LayoutBuilder, Linear, Scratch, View, ViewMut, activation, linear, math, matmul,
     vectorized,
 };
 use std::ops::Range;
@@ -56,15 +56,15 @@ pub struct Tables {
 #[derive(Debug, Default)]
 pub struct DecoderState {
     /// The head's hidden layer before the context is added, `[R, h]`.
-    base: Vec<f32>,
+    base: Buffer,
     /// Scores of every token, `[R, H K]`.
-    scores: Vec<f32>,
+    scores: Buffer,
     /// Softmax weights, `[R, H K]`.
-    weights: Vec<f32>,
+    weights: Buffer,
     /// The head's hidden layer, `[R, h]`.
-    hidden: Vec<f32>,
+    hidden: Buffer,
     /// Q, `[R, A]`.
-    pub utilities: Vec<f32>,
+    pub utilities: Buffer,
 }
 
 /// How often each token stands before an agent: the start token and its predecessors' actions.
@@ -145,12 +145,13 @@ impl Decoder {
         for token in 0..k {
             tables.tokens.extend((0..h).map(|i| embed.row(i)[token].max(0.0)));
         }
-        let mut key_values = ViewMut::dense(fit(&mut tables.key_values, k * 2 * a), 2 * a);
+        tables.key_values = vec![0.0; k * 2 * a];
+        let mut key_values = ViewMut::dense(&mut tables.key_values, 2 * a);
         attention.key_value.forward(params, View::dense(&tables.tokens, h), key_values.reborrow());
         activation::relu(key_values.columns(a..2 * a));
 
-        fit(&mut tables.scores, heads * k * h);
-        fit(&mut tables.contexts, heads * k * h);
+        tables.scores = vec![0.0; heads * k * h];
+        tables.contexts = vec![0.0; heads * k * h];
         for head in 0..heads {
             let columns = head * head_dim..(head + 1) * head_dim;
             let (keys, values) = keys_and_values(&tables.key_values, a, columns.clone());
@@ -158,10 +159,12 @@ impl Decoder {
             let query = attention.query.weight(params).rows(columns.clone());
             let scores = ViewMut::dense(&mut tables.scores[part.clone()], h);
             matmul::dy_w(keys, query, scores, Accum::Replace);
-            for token in 0..k {
-                let bias = math::dot(keys.row(token), &attention.query.bias(params)[columns.clone()]);
-                tables.score_bias.push(scale * bias);
-            }
+            push_products(
+                &mut tables.score_bias,
+                scale,
+                keys,
+                &attention.query.bias(params)[columns.clone()],
+            );
             let (_, context, _) = self.head_columns(head);
             let weight = self.head_hidden.weight(params).columns(context);
             let contexts = ViewMut::dense(&mut tables.contexts[part], h);
@@ -180,7 +183,7 @@ impl Decoder {
         let scale = 1.0 / (head_dim as f32).sqrt();
         d.scores.iter_mut().for_each(|score| *score *= scale);
         d.score_bias.iter_mut().for_each(|bias| *bias *= scale);
-        fit(&mut d.key_values, k * 2 * a);
+        d.key_values = vec![0.0; k * 2 * a];
         for head in 0..heads {
             let columns = head * head_dim..(head + 1) * head_dim;
             let (keys, values) = keys_and_values(&tables.key_values, a, columns.clone());
@@ -196,20 +199,14 @@ impl Decoder {
                 attention.query.weight_mut(grads).rows(columns.clone()),
                 Accum::Add,
             );
-            let query_bias = &mut attention.query.bias_mut(grads)[columns.clone()];
-            for (token, &d_bias) in d_bias.iter().enumerate() {
-                math::add_scaled(query_bias, d_bias, keys.row(token));
-            }
+            add_weighted_rows(&mut attention.query.bias_mut(grads)[columns.clone()], d_bias, keys);
             let weight = self.head_hidden.weight_mut(grads).columns(context.clone());
             matmul::dyt_x(d_contexts, values, weight, Accum::Add);
 
             let mut d_keys = ViewMut::dense(&mut d.key_values, 2 * a).columns(columns.clone());
             let query = attention.query.weight(params).rows(columns.clone());
             matmul::x_wt(d_scores, query, d_keys.reborrow(), Accum::Replace);
-            for (token, &d_bias) in d_bias.iter().enumerate() {
-                let bias = &attention.query.bias(params)[columns.clone()];
-                math::add_scaled(d_keys.row(token), d_bias, bias);
-            }
+            add_outer_product(d_keys, d_bias, &attention.query.bias(params)[columns.clone()]);
             let d_values =
                 ViewMut::dense(&mut d.key_values, 2 * a).columns(a + columns.start..a + columns.end);
             let weight = self.head_hidden.weight(params).columns(context);
@@ -217,7 +214,8 @@ impl Decoder {
         }
         let values = View::dense(&tables.key_values, 2 * a).columns(a..2 * a);
         activation::relu_backward(values, ViewMut::dense(&mut d.key_values, 2 * a).columns(a..2 * a));
-        let d_tokens = ViewMut::dense(fit(&mut d.tokens, k * h), h);
+        d.tokens = vec![0.0; k * h];
+        let d_tokens = ViewMut::dense(&mut d.tokens, h);
         let tokens = View::dense(&tables.tokens, h);
         attention.key_value.backward(
             params,
@@ -249,16 +247,16 @@ impl Decoder {
         let (h, width) = (self.hidden_dim, tables.score_bias.len());
         let (tau, _, z) = self.head_columns(0);
         let weight = self.head_hidden.weight(params);
-        let mut base = ViewMut::dense(fit(&mut state.base, history.rows * h), h);
+        let mut base = ViewMut::dense(state.base.fit(history.rows * h), h);
         matmul::x_wt(history, weight.columns(tau), base.reborrow(), Accum::Replace);
         if self.representation_dim > 0 {
             matmul::x_wt(representation, weight.columns(z), base, Accum::Add);
         }
-        let scores = ViewMut::dense(fit(&mut state.scores, history.rows * width), width);
+        let scores = ViewMut::dense(state.scores.fit(history.rows * width), width);
         matmul::x_wt(history, View::dense(&tables.scores, h), scores, Accum::Replace);
-        fit(&mut state.weights, history.rows * width);
-        fit(&mut state.hidden, history.rows * h);
-        fit(&mut state.utilities, history.rows * self.n_actions);
+        state.weights.fit(history.rows * width);
+        state.hidden.fit(history.rows * h);
+        state.utilities.fit(history.rows * self.n_actions);
     }
 
     /// One agent's decision: Q (A) from what its predecessors did. `row` has been prepared.
@@ -421,6 +419,31 @@ vectorized! {
                 actions[row] = best(decoder.decide(params, tables, row, &seen, state), available);
                 seen.push(actions[row]);
             }
+        }
+    }
+}
+
+vectorized! {
+    /// Appends scale · row · vector for every row.
+    fn push_products<'a>(to: &'a mut Vec<f32>, scale: f32, rows: View<'a>, vector: &'a [f32]) {
+        to.extend((0..rows.rows).map(|row| scale * math::dot(rows.row(row), vector)));
+    }
+}
+
+vectorized! {
+    /// sum += Σ weight · row.
+    fn add_weighted_rows<'a>(sum: &'a mut [f32], weights: &'a [f32], rows: View<'a>) {
+        for (row, &weight) in weights.iter().enumerate() {
+            math::add_scaled(sum, weight, rows.row(row));
+        }
+    }
+}
+
+vectorized! {
+    /// row += weight · vector, for every row.
+    fn add_outer_product<'a>(rows: ViewMut<'a>, weights: &'a [f32], vector: &'a [f32]) {
+        for (row, &weight) in weights.iter().enumerate() {
+            math::add_scaled(rows.row(row), weight, vector);
         }
     }
 }

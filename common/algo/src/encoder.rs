@@ -3,9 +3,9 @@
 
 use crate::Rows;
 use rit_nn::{
-    Attention, LayoutBuilder, Linear, Scratch, View, ViewMut, activation,
+    Attention, Buffer, LayoutBuilder, Linear, Scratch, View, ViewMut, activation,
     attention::{AttentionState, Group, Visible},
-    fit, math, vectorized,
+    math, vectorized,
 };
 
 /// x = ReLU(`embed`(entities)), d → h, and [x_k ‖ `attention`(x_k over the entities it sees)], h + a.
@@ -19,10 +19,10 @@ pub struct Encoder {
 #[derive(Debug, Default)]
 pub struct EncoderState {
     /// x, `[E, h]`.
-    x: Vec<f32>,
+    x: Buffer,
     attention: AttentionState,
     /// [x_k ‖ attention], `[R, h + a]`.
-    pub encoded: Vec<f32>,
+    pub encoded: Buffer,
 }
 
 impl Encoder {
@@ -60,9 +60,9 @@ impl Encoder {
     /// Fills `state.encoded`.
     pub fn forward(&self, params: &[f32], rows: &Rows, visible: Visible<'_>, state: &mut EncoderState) {
         let (h, width) = (self.hidden_dim(), self.width());
-        let x = fit(&mut state.x, rows.entity_rows() * h);
+        let x = state.x.fit(rows.entity_rows() * h);
         self.embed.forward_relu(params, rows.entities(), ViewMut::dense(x, h));
-        let encoded = fit(&mut state.encoded, rows.agent_rows() * width);
+        let encoded = state.encoded.fit(rows.agent_rows() * width);
         for group in &rows.groups {
             for (agent, entity) in group.queries.clone().zip(group.keys.clone()) {
                 encoded[agent * width..][..h].copy_from_slice(&state.x[entity * h..][..h]);

@@ -12,10 +12,10 @@ use crate::{
     rit::RitConfig,
 };
 use rit_nn::{
-    LayoutBuilder, Linear, Scratch, View, ViewMut, activation,
+    Buffer, LayoutBuilder, Linear, Scratch, View, ViewMut, activation,
     activation::{elu, elu_slope},
     attention::{Group, Visible},
-    fit, linear, math, vectorized,
+    linear, math, vectorized,
 };
 use std::ops::Range;
 
@@ -38,21 +38,21 @@ pub struct Mixer {
 pub struct MixerState {
     pub(crate) encoder: EncoderState,
     /// c, `[R, h + h_z]`.
-    context: Vec<f32>,
+    context: Buffer,
     /// ReLU'd w1_hidden, w2_hidden, b2_hidden, and b1, `[R, 2y + 2x]`.
-    hyper: Vec<f32>,
+    hyper: Buffer,
     /// `w1`'s output, signed, `[R, x]`; backward leaves its gradient here.
-    w1: Vec<f32>,
+    w1: Buffer,
     /// Means over agents of w2_hidden, b2_hidden and b1, `[G, y + 2x]`.
-    means: Vec<f32>,
+    means: Buffer,
     /// `w2`'s output, signed, `[G, x]`; backward leaves its gradient here.
-    w2: Vec<f32>,
+    w2: Buffer,
     /// b₂, `[G]`.
-    b2: Vec<f32>,
+    b2: Buffer,
     /// ELU's output, `[G, x]`.
-    hidden: Vec<f32>,
+    hidden: Buffer,
     /// Q_total, `[G]`.
-    pub q_total: Vec<f32>,
+    pub q_total: Buffer,
 }
 
 impl Mixer {
@@ -92,26 +92,26 @@ impl Mixer {
         self.encoder.forward(params, rows, Visible::All, &mut state.encoder);
         let (_, attended) = self.encoder.split(View::dense(&state.encoder.encoded, self.encoder.width()));
         let width = self.hyper.inputs;
-        let mut context = ViewMut::dense(fit(&mut state.context, agents * width), width);
+        let mut context = ViewMut::dense(state.context.fit(agents * width), width);
         for row in 0..representation.rows {
             context.row(row)[h..].copy_from_slice(representation.row(row));
         }
         self.out.forward(params, attended, context.columns(0..h));
 
         let outputs = self.hyper.outputs;
-        let mut hyper = ViewMut::dense(fit(&mut state.hyper, agents * outputs), outputs);
+        let mut hyper = ViewMut::dense(state.hyper.fit(agents * outputs), outputs);
         self.hyper.forward(params, View::dense(&state.context, width), hyper.reborrow());
         activation::relu(hyper.reborrow().columns(0..2 * y + x));
-        let w1 = ViewMut::dense(fit(&mut state.w1, agents * x), x);
+        let w1 = ViewMut::dense(state.w1.fit(agents * x), x);
         self.w1.forward(params, hyper.as_view().columns(0..y), w1);
 
         let mean_width = y + 2 * x;
-        let means = fit(&mut state.means, groups * mean_width);
+        let means = state.means.fit(groups * mean_width);
         average(&rows.groups, View::dense(&state.hyper, outputs).columns(y..outputs), means);
         let (w2_hidden, b2_hidden, _) = self.mean_columns();
         let means = View::dense(means, mean_width);
-        self.w2.forward(params, means.columns(w2_hidden), ViewMut::dense(fit(&mut state.w2, groups * x), x));
-        self.b2.forward(params, means.columns(b2_hidden), ViewMut::dense(fit(&mut state.b2, groups), 1));
+        self.w2.forward(params, means.columns(w2_hidden), ViewMut::dense(state.w2.fit(groups * x), x));
+        self.b2.forward(params, means.columns(b2_hidden), ViewMut::dense(state.b2.fit(groups), 1));
     }
 
     /// Fills `state.q_total` (G) from each agent's chosen utility `q` (R), after [`Mixer::prepare`].
@@ -119,7 +119,7 @@ impl Mixer {
         let (groups, x, y) = (rows.groups.len(), self.mixing_dim(), self.w1.inputs);
         let (_, _, b1) = self.mean_columns();
         let MixerState { w1, w2, b2, means, hidden, q_total, .. } = state;
-        let (hidden, q_total) = (fit(hidden, groups * x), fit(q_total, groups));
+        let (hidden, q_total) = (hidden.fit(groups * x), q_total.fit(groups));
         let b1 = View::dense(means, y + 2 * x).columns(b1);
         mix(&rows.groups, q, [w1, w2, b2], b1, hidden, q_total);
     }

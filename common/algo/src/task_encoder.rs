@@ -8,9 +8,8 @@ use crate::{
 };
 use faer::Accum;
 use rit_nn::{
-    Gru, LayoutBuilder, Linear, Scratch, View, ViewMut, activation,
+    Buffer, Gru, LayoutBuilder, Linear, Scratch, View, ViewMut, activation,
     attention::{Group, Visible},
-    fit,
     gru::GruState,
     math, matmul, vectorized,
 };
@@ -33,10 +32,10 @@ pub struct TaskEncoder {
 pub struct TaskEncoderState {
     pub(crate) encoder: EncoderState,
     /// ReLU'd reward embeddings, `[groups, r]`: the reward is the team's, so it is embedded once per group.
-    rewards: Vec<f32>,
+    rewards: Buffer,
     pub(crate) gru: GruState,
     /// z, `[R, h_z]`.
-    pub representation: Vec<f32>,
+    pub representation: Buffer,
 }
 
 impl TaskEncoder {
@@ -72,14 +71,14 @@ impl TaskEncoder {
         self.encoder.forward(params, rows, Visible::Where(&rows.others), &mut state.encoder);
 
         let groups = rows.groups.len();
-        let rewards = ViewMut::dense(fit(&mut state.rewards, groups * r), r);
+        let rewards = ViewMut::dense(state.rewards.fit(groups * r), r);
         self.reward_embed.forward_relu(params, View::dense(&rows.previous_rewards, 1), rewards);
         let mut reward_gates = scratch.take(groups * 3 * h);
         let rewards = View::dense(&state.rewards, r);
         let to = ViewMut::dense(&mut reward_gates, 3 * h);
         matmul::x_wt(rewards, weight.columns(reward_columns), to, Accum::Replace);
 
-        let gates = fit(&mut state.gru.gates, rows.agent_rows() * 3 * h);
+        let gates = state.gru.gates.fit(rows.agent_rows() * 3 * h);
         let encoded = View::dense(&state.encoder.encoded, self.encoder.width());
         let to = ViewMut::dense(gates, 3 * h);
         matmul::x_wt(encoded, weight.columns(encoded_columns), to, Accum::Replace);
@@ -88,7 +87,7 @@ impl TaskEncoder {
         self.gru.forward(params, &rows.agent_times, before, &mut state.gru, scratch);
 
         let z = self.out.outputs;
-        let representation = ViewMut::dense(fit(&mut state.representation, rows.agent_rows() * z), z);
+        let representation = ViewMut::dense(state.representation.fit(rows.agent_rows() * z), z);
         self.out.forward(params, View::dense(&state.gru.history, h), representation);
     }
 

@@ -7,7 +7,7 @@ use crate::{
     rit::RitConfig,
 };
 use faer::Accum;
-use rit_nn::{Gru, LayoutBuilder, Scratch, View, ViewMut, attention::Visible, fit, gru::GruState, matmul};
+use rit_nn::{Gru, LayoutBuilder, Scratch, View, ViewMut, attention::Visible, gru::GruState, matmul};
 
 /// The utility function network.
 #[derive(Clone, Debug)]
@@ -54,7 +54,7 @@ impl Utility {
         let h = self.gru.hidden_dim;
         self.encoder.forward(params, rows, Visible::Where(&rows.others), &mut state.encoder);
         let encoded = View::dense(&state.encoder.encoded, self.encoder.width());
-        let gates = fit(&mut state.gru.gates, rows.agent_rows() * 3 * h);
+        let gates = state.gru.gates.fit(rows.agent_rows() * 3 * h);
         matmul::x_wt(encoded, self.gru.input.weight(params), ViewMut::dense(gates, 3 * h), Accum::Replace);
         self.gru.forward(params, &rows.agent_times, before, &mut state.gru, scratch);
         let history = View::dense(&state.gru.history, h);

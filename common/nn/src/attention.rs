@@ -4,7 +4,7 @@
 //! sees nothing gets zeros, exactly, and passes no gradient.
 
 use crate::{
-    LayoutBuilder, Linear, Scratch, View, ViewMut, fit, for_lanes, linear,
+    Buffer, LayoutBuilder, Linear, Scratch, View, ViewMut, for_lanes, linear,
     math::{self, LANES, Lanes, each, load, store},
     matmul, vectorized,
 };
@@ -54,11 +54,11 @@ pub enum Visible<'a> {
 #[derive(Debug, Default)]
 pub struct AttentionState {
     /// `[Q, a]`.
-    queries: Vec<f32>,
+    queries: Buffer,
     /// Keys and ReLU'd values, `[K, 2a]`.
-    key_values: Vec<f32>,
+    key_values: Buffer,
     /// Softmax weights; the groups' `[heads, queries, keys]` one after another.
-    weights: Vec<f32>,
+    weights: Buffer,
 }
 
 impl Attention {
@@ -73,9 +73,9 @@ impl Attention {
     /// Queries, keys (without their bias) and values of all rows. `x_queries` (Q, h), `x_keys` (K, h).
     pub fn project(&self, params: &[f32], x_queries: View<'_>, x_keys: View<'_>, state: &mut AttentionState) {
         let a = self.dim;
-        let queries = ViewMut::dense(fit(&mut state.queries, x_queries.rows * a), a);
+        let queries = ViewMut::dense(state.queries.fit(x_queries.rows * a), a);
         self.query.forward(params, x_queries, queries);
-        let mut key_values = ViewMut::dense(fit(&mut state.key_values, x_keys.rows * 2 * a), 2 * a);
+        let mut key_values = ViewMut::dense(state.key_values.fit(x_keys.rows * 2 * a), 2 * a);
         matmul::x_wt(x_keys, self.key_value.weight(params), key_values.reborrow(), Accum::Replace);
         // The key's bias adds the same to all scores of a query, which softmax does not see: it is left out, and
         // its gradient is zero.
@@ -92,7 +92,7 @@ impl Attention {
     ) {
         let AttentionState { queries, key_values, weights } = state;
         let pairs: usize = groups.iter().map(Group::pairs).sum();
-        let weights = fit(weights, pairs * self.heads);
+        let weights = weights.fit(pairs * self.heads);
         let queries = View::dense(queries, self.dim);
         score(queries, key_values, groups, visible, weights, self.head_dim());
         exponentiate(weights);
@@ -231,13 +231,13 @@ vectorized! {
     ) {
         let a = queries.cols;
         let (d_queries, d_key_values) = d;
-        let mut d_scores = Vec::new();
+        let mut d_scores = Buffer::default();
         for group in groups {
             let (keys, values) = keys_and_values(key_values, group, a);
             let (queries, d_out) = (queries.rows(group.queries.clone()), d_out.rows(group.queries.clone()));
             let d_queries = &mut d_queries[group.queries.start * a..group.queries.end * a];
             let d_key_values = &mut d_key_values[group.keys.start * 2 * a..group.keys.end * 2 * a];
-            let d_scores = fit(&mut d_scores, group.pairs());
+            let d_scores = d_scores.fit(group.pairs());
             for head in heads(a, head_dim) {
                 let (weights_here, behind) = weights.split_at(group.pairs());
                 weights = behind;

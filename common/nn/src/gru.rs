@@ -4,7 +4,7 @@
 //! time are a prefix of those before: sequences are ordered longest first.
 
 use crate::{
-    LayoutBuilder, Linear, Scratch, View, ViewMut, fit, for_lanes, linear,
+    Buffer, LayoutBuilder, Linear, Scratch, View, ViewMut, for_lanes, linear,
     math::{LANES, Lanes, each, load, sigmoid, store, tanh},
     matmul, vectorized,
 };
@@ -26,11 +26,11 @@ pub struct Gru {
 #[derive(Debug, Default)]
 pub struct GruState {
     /// In: the input's share of the gates, Wᵢ x without its bias. Out: r, u, n. `[R, 3h]`.
-    pub gates: Vec<f32>,
+    pub gates: Buffer,
     /// Wₕₙ h + bₕₙ, `[R, h]`.
-    new_from_hidden: Vec<f32>,
+    new_from_hidden: Buffer,
     /// The hidden state after each row, `[R, h]`.
-    pub history: Vec<f32>,
+    pub history: Buffer,
 }
 
 impl Gru {
@@ -61,8 +61,8 @@ impl Gru {
         let h = self.hidden_dim;
         let rows = times.last().copied().unwrap_or(0);
         debug_assert_eq!(state.gates.len(), rows * 3 * h);
-        fit(&mut state.new_from_hidden, rows * h);
-        fit(&mut state.history, rows * h);
+        state.new_from_hidden.fit(rows * h);
+        state.history.fit(rows * h);
         let mut from_hidden = scratch.take(times.get(1).map_or(0, |&rows| rows * 3 * h));
         for (time, range) in times.windows(2).map(|pair| pair[0]..pair[1]).enumerate() {
             let (done, ahead) = state.history.split_at_mut(range.start * h);
@@ -247,7 +247,7 @@ mod tests {
 
     fn run(gru: &Gru, params: &[f32], x: &[f32], times: &[usize], before: Option<View<'_>>) -> GruState {
         let mut state = GruState::default();
-        let gates = fit(&mut state.gates, x.len() / INPUTS * 3 * H);
+        let gates = state.gates.fit(x.len() / INPUTS * 3 * H);
         let to = ViewMut::dense(gates, 3 * H);
         matmul::x_wt(View::dense(x, INPUTS), gru.input.weight(params), to, Accum::Replace);
         gru.forward(params, times, before, &mut state, &mut Scratch::default());
@@ -296,13 +296,13 @@ mod tests {
         let (gru, len) = unit();
         let (params, x) = (noise(1, len), noise(2, 6 * INPUTS));
         let all = run(&gru, &params, &x, &TIMES, None);
-        let mut before: Option<Vec<f32>> = None;
+        let mut before: Option<Buffer> = None;
         for time in TIMES.windows(2) {
             let rows = time[1] - time[0];
             let x = &x[time[0] * INPUTS..time[1] * INPUTS];
             let previous = before.as_ref().map(|h| View::dense(h, H).rows(0..rows));
             let state = run(&gru, &params, x, &[0, rows], previous);
-            assert_eq!(state.history, all.history[time[0] * H..time[1] * H]);
+            assert_eq!(state.history[..], all.history[time[0] * H..time[1] * H]);
             before = Some(state.history);
         }
     }

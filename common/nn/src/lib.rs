@@ -25,4 +25,4 @@ pub use layout::{Layout, LayoutBuilder, Param};
 pub use linear::Linear;
 pub use optimizer::{Optimizer, OptimizerKind};
 pub use scratch::{Buffer, Scratch};
-pub use view::{View, ViewMut, fit};
+pub use view::{View, ViewMut};

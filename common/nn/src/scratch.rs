@@ -1,5 +1,5 @@
-//! Buffers that live for one call and are kept for the next: in the steady state nothing is allocated, and
-//! nothing is filled that will be written anyway.
+//! Buffers that are kept from one call to the next: in the steady state nothing is allocated, and nothing is
+//! filled that will be written anyway.
 
 use std::ops::{Deref, DerefMut};
 
@@ -10,7 +10,7 @@ pub struct Scratch {
 }
 
 /// A slice that owns its memory, and more of it than it shows.
-#[derive(Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct Buffer {
     memory: Vec<f32>,
     len: usize,
@@ -24,11 +24,10 @@ impl Scratch {
         let all = 0..self.free.len();
         let best = all.clone().filter(|at| length(at) >= len).min_by_key(length);
         let best = best.or_else(|| all.max_by_key(length));
-        let mut memory = best.map(|at| self.free.swap_remove(at)).unwrap_or_default();
-        if memory.len() < len {
-            memory.resize(len, 0.0);
-        }
-        Buffer { memory, len }
+        let memory = best.map(|at| self.free.swap_remove(at)).unwrap_or_default();
+        let mut buffer = Buffer { memory, len: 0 };
+        buffer.fit(len);
+        buffer
     }
 
     /// A buffer of zeros.
@@ -41,6 +40,17 @@ impl Scratch {
     /// Takes a buffer back.
     pub fn give(&mut self, buffer: Buffer) {
         self.free.push(buffer.memory);
+    }
+}
+
+impl Buffer {
+    /// Makes it exactly this long. It holds whatever it held before: to be written whole before it is read.
+    pub fn fit(&mut self, len: usize) -> &mut [f32] {
+        if self.memory.len() < len {
+            self.memory.resize(len, 0.0);
+        }
+        self.len = len;
+        self
     }
 }
 

@@ -88,10 +88,3 @@ impl<'a> ViewMut<'a> {
         Self { data: &mut self.data[start..], rows: self.rows, cols: columns.len(), stride: self.stride }
     }
 }
-
-/// Makes a scratch buffer exactly this long, keeping its memory. What it holds is whatever it held before:
-/// for buffers that are written whole before they are read.
-pub fn fit(buffer: &mut Vec<f32>, len: usize) -> &mut [f32] {
-    buffer.resize(len, 0.0);
-    buffer
-}
