@@ -82,11 +82,11 @@ impl Process {
         self.child.wait().await
     }
 
-    /// Starts it again.
+    /// Whether it may be started again.
     ///
     /// # Errors
-    /// When it has died too often of late, or the system refuses.
-    pub fn restart(&mut self) -> Result<(), Failure> {
+    /// When it has died too often of late.
+    pub fn may_restart(&mut self) -> Result<(), Failure> {
         self.starts.retain(|start| start.elapsed() < RESTART_WINDOW);
         if self.starts.len() >= RESTARTS_MAX {
             let (name, seconds) = (&self.name, RESTART_WINDOW.as_secs());
@@ -95,6 +95,15 @@ impl Process {
                 self.last_words()
             )));
         }
+        Ok(())
+    }
+
+    /// Starts it again.
+    ///
+    /// # Errors
+    /// When it may not be, or the system refuses.
+    pub fn restart(&mut self) -> Result<(), Failure> {
+        self.may_restart()?;
         self.starts.push(Instant::now());
         self.child = spawn(&self.command, &self.log).map_err(|error| cannot_start(&self.name, &error))?;
         self.lifeline = self.child.stdin.take();

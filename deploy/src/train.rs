@@ -198,6 +198,7 @@ impl Run<'_> {
                     return Ok(control);
                 }
                 Err(error) => {
+                    learner.may_restart()?;
                     self.progress.say(&format!("{error}; the actors are started anew too"));
                     self.end_actors().await;
                     learner.end().await;

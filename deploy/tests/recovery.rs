@@ -190,6 +190,7 @@ fn a_learner_that_dies_again_and_again_is_given_up() {
     assert_eq!(output.status.code(), Some(1));
     let stderr = String::from_utf8_lossy(&output.stderr);
     assert!(stderr.contains("error: learner died 5 times within 60 s and is given up"), "{stderr}");
+    assert!(!stderr.contains("started anew"), "nothing is after that: {stderr}");
     assert!(shared_memory_of(&folder.run_dir()).is_empty());
 }
 
