@@ -169,7 +169,7 @@ impl Cluster {
 
     fn start(&self, settings: &[&str]) -> (common::Train, Vec<Actor>) {
         let mut arguments: Vec<String> = RUN.iter().map(|&word| word.to_owned()).collect();
-        arguments.extend(["--actors".into(), "0".into()]);
+        arguments.extend(["--json", "--actors", "0"].map(str::to_owned));
         let mut set = |setting: String| arguments.extend(["--set".to_owned(), setting]);
         set(format!("actors.remote={}", self.actors));
         set("learner.listen=tcp:10.77.0.1:50051".into());

@@ -4,7 +4,7 @@
 mod common;
 
 use common::{
-    RunFolder, Train, actor_pid, json_lines, kill, learner_pid, pids, shared_memory_of, wait_until_gone,
+    RunFolder, Train, actor_pid, json_lines, kill, learner_pid, pids, rit, shared_memory_of, wait_until_gone,
 };
 use rustix::process::Signal;
 use serde_json::Value;
@@ -179,11 +179,13 @@ fn a_damaged_checkpoint_is_reported_and_the_one_before_is_used() {
 #[test]
 fn a_learner_that_dies_again_and_again_is_given_up() {
     let folder = RunFolder::new();
-    let mut train = folder.start(&["matrix-game", "--actors", "1"]);
-    let mut killed = 0;
-    for _ in 0..5 {
-        let status = train.wait_for("a learner", |status| learner_pid(status) != killed);
-        killed = learner_pid(&status);
+    let mut train = folder.start_as(rit(&[]), &["matrix-game", "--actors", "1"]);
+    let begun = train.wait_for("an actor", |status| actor_pid(status, "actor-0").is_some());
+    let mut killed = learner_pid(&begun);
+    kill(killed, Signal::KILL);
+    // The others before `rit train` has heard of them.
+    for _ in 1..5 {
+        killed = train.wait_for_learner_process(killed);
         kill(killed, Signal::KILL);
     }
     let output = train.wait();

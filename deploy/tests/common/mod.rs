@@ -85,15 +85,15 @@ impl RunFolder {
         self.start(arguments).finish()
     }
 
-    /// Starts to train.
+    /// Starts to train; what is not the summary is kept quiet.
     pub fn start(&self, arguments: &[&str]) -> Train {
-        self.start_as(rit(&[]), arguments)
+        self.start_as(rit(&[]), &[&["--json"], arguments].concat())
     }
 
-    /// Starts to train by a command that executes `rit`.
+    /// Starts to train by a command that executes `rit`, and says what happens on standard error.
     pub fn start_as(&self, mut command: Command, arguments: &[&str]) -> Train {
         let run_dir = self.run_dir();
-        command.args(["train", "--json", "--run-dir", run_dir.to_str().unwrap()]);
+        command.args(["train", "--run-dir", run_dir.to_str().unwrap()]);
         let child = command.args(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
         Train { child: Some(child), run_dir }
     }
@@ -128,6 +128,25 @@ impl Train {
                 let output = self.child.take().unwrap().wait_with_output().unwrap();
                 panic!("waiting for {what}: {:?} {}", output.status, String::from_utf8_lossy(&output.stderr));
             }
+        }
+    }
+
+    /// A learner's process other than this one, from its first moment on, before it says anything.
+    pub fn wait_for_learner_process(&mut self, other_than: u32) -> u32 {
+        let begun = Instant::now();
+        let run_dir = self.run_dir.to_str().unwrap();
+        let is_learner = |pid: u32| {
+            let line = fs::read_to_string(format!("/proc/{pid}/cmdline")).unwrap_or_default();
+            let words: Vec<&str> = line.split('\0').collect();
+            words.get(1) == Some(&"learner") && words.contains(&run_dir)
+        };
+        loop {
+            let entries = fs::read_dir("/proc").unwrap();
+            let mut pids = entries.filter_map(|entry| entry.unwrap().file_name().to_str()?.parse().ok());
+            if let Some(pid) = pids.find(|&pid| pid != other_than && is_learner(pid)) {
+                return pid;
+            }
+            assert!(begun.elapsed() < DEADLINE, "no learner is started");
         }
     }
 
