@@ -112,8 +112,12 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
         }
     }
     let task_set = config.environment.task_set;
-    if config.environment.approach_shaping != 0.0 && !task_set.has_prey() {
-        return Err(ConfigError::Meaningless { key: "environment.approach_shaping", task_set });
+    let meaningless = [
+        ("environment.approach_shaping", config.environment.approach_shaping != 0.0 && !task_set.has_prey()),
+        ("environment.view_radius", config.environment.view_radius.is_finite() && !task_set.has_places()),
+    ];
+    if let Some(&(key, _)) = meaningless.iter().find(|(_, meaningless)| *meaningless) {
+        return Err(ConfigError::Meaningless { key, task_set });
     }
     config.rit().validate()?;
     Ok(config)
@@ -383,6 +387,10 @@ mod tests {
         assert_eq!(
             message(&["environment.approach_shaping=5"]),
             "environment.approach_shaping means nothing to matrix-game; leave it out"
+        );
+        assert_eq!(
+            message(&["environment.view_radius=1"]),
+            "environment.view_radius means nothing to matrix-game; leave it out"
         );
         assert_eq!(message(&["network.n_heads=3"]), "attention_dim 64 is not a multiple of n_heads 3");
         assert!(message(&["training.until=win_rate=2"]).contains("write win_rate=NUMBER"));

@@ -85,3 +85,72 @@ impl Seated {
         self.decision_order.get(row).map_or(row, |&agent| usize::from(agent))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rit_episode::{RunSeed, Stream};
+
+    /// Three agents and one more entity. Every number says where it belongs: 10 · agent + entity, or + action.
+    struct Labelled;
+
+    impl Environment for Labelled {
+        fn n_agents(&self) -> usize {
+            3
+        }
+
+        fn n_entities(&self) -> usize {
+            4
+        }
+
+        fn feature_dim(&self) -> usize {
+            1
+        }
+
+        fn n_actions(&self) -> usize {
+            2
+        }
+
+        fn steps_max(&self) -> usize {
+            1
+        }
+
+        fn reset(&mut self, _: &mut Rng) {}
+
+        fn observe(&self, observation: &mut Observation) {
+            for entity in 0..4 {
+                observation.entity_mut(entity)[0] = f32::from(entity as u8);
+            }
+            for agent in 0..3 {
+                let label = |at: usize| (10 * agent + at) as u8;
+                observation.observable_mut(agent).copy_from_slice(&[0, 1, 2, 3].map(label));
+                observation.available_mut(agent).copy_from_slice(&[0, 1].map(label));
+            }
+        }
+
+        fn step(&mut self, actions: &[Action], _: &mut Rng) -> Step {
+            // What it was told, agent 0's action first.
+            let told = actions.iter().fold(0.0, |told, &action| 10.0 * told + f32::from(action));
+            Step { reward: told, shaping: 0.0, end: None, won: false }
+        }
+    }
+
+    #[test]
+    fn the_decision_order_reorders_every_axis_of_agents_and_actions_go_back() {
+        let mut rng = RunSeed(0).stream(Stream::Environment, 0);
+        let (mut seated, mut seen) = (Seated::new(Box::new(Labelled)), Observation::default());
+        // Agent 2 decides first, then 0, then 1.
+        seated.reset(vec![2, 0, 1], &mut rng);
+        seated.observe(&mut seen);
+        // Feature, last action.
+        assert_eq!(seen.entities(), [2., 0., 0., 0., 0., 0., 1., 0., 0., 3., 0., 0.]);
+        assert_eq!(seen.observable(), [22, 20, 21, 23, 2, 0, 1, 3, 12, 10, 11, 13]);
+        assert_eq!(seen.available(), [20, 21, 0, 1, 10, 11]);
+
+        // The first to decide, agent 2, takes action 1, agent 0 action 0, agent 1 action 1.
+        assert_eq!(seated.step(&[1, 0, 1], &mut rng).reward, 11.0);
+        assert_eq!(seated.step(&[0, 0, 1], &mut rng).reward, 10.0);
+        seated.observe(&mut seen);
+        assert_eq!(seen.entities(), [2., 1., 0., 0., 1., 0., 1., 0., 1., 3., 0., 0.]);
+    }
+}

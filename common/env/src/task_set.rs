@@ -106,6 +106,14 @@ impl TaskSet {
         }
     }
 
+    /// Whether its entities have places, so that some are nearer than others.
+    pub fn has_places(self) -> bool {
+        match self {
+            Self::CooperativeNavigation | Self::PredatorPrey | Self::PredatorPreyPro => true,
+            Self::MatrixGame => false,
+        }
+    }
+
     /// The padded sizes over all its tasks, testing tasks included (paper, appendix A).
     pub fn dims(self) -> Dims {
         let tasks = [Split::Training, Split::Testing].into_iter().flat_map(|split| self.tasks(split));

@@ -227,9 +227,10 @@ fn contact_force(first: Vector, second: Vector, touching: f32) -> Option<Vector>
     })
 }
 
-/// ln(1 + eˣ) without overflow.
+/// ln(1 + eˣ) without overflow. Not by the functions of the system's library, whose last bit differs from one machine
+/// to the next: an episode is the same wherever it is rolled.
 fn softplus(x: f32) -> f32 {
-    x.max(0.0) + (-x.abs()).exp().ln_1p()
+    x.max(0.0) + libm::log1pf(libm::expf(-x.abs()))
 }
 
 pub(super) fn squared_distance(a: Vector, b: Vector) -> f32 {

@@ -168,3 +168,61 @@ fn the_scene_shows_predators_obstacles_and_prey() {
     );
     assert_eq!([scene.bodies[3].x, scene.bodies[3].y], [1.0, 0.0]);
 }
+
+#[test]
+fn predators_and_prey_are_as_fast_as_they_should_be() {
+    // The predator drives right and the prey flees to the right before it. v = 0.75 v + 0.3 would go to 1.2,
+    // v = 0.75 v + 0.4 · offset to more than 1.3.
+    let mut environment = placed(&[[-3.0, 0.0]], &[[0.0, 0.0]], Plain);
+    let mut rng = stream(0);
+    let speeds: Vec<[f32; 2]> = (0..20)
+        .map(|_| {
+            environment.step(&[2], &mut rng);
+            [environment.predators()[0].velocity, environment.prey()[0].velocity].map(|v| v[0].hypot(v[1]))
+        })
+        .collect();
+    assert!((speeds[0][0] - 0.3).abs() < 1e-6, "{speeds:?}");
+    for (speed, limit) in speeds[19].into_iter().zip([1.0, 1.3]) {
+        assert!((speed - limit).abs() < 1e-6, "{speeds:?}");
+    }
+}
+
+#[test]
+fn everyone_begins_in_a_square_and_obstacles_in_a_smaller_one() {
+    let mut environment = PredatorPrey::new(3, 2, Plain, EnvironmentOptions::default());
+    let mut farthest = [0.0_f32; 7];
+    for episode in 0..500 {
+        environment.reset(&mut stream(episode));
+        for (farthest, body) in farthest.iter_mut().zip(&environment.world.bodies) {
+            *farthest = body.position.iter().fold(*farthest, |most, x| most.max(x.abs()));
+        }
+    }
+    for (body, farthest) in farthest.into_iter().enumerate() {
+        let half = if (3..5).contains(&body) { 0.9 } else { 1.0 };
+        assert!(farthest <= half && farthest > half - 0.01, "body {body}: {farthest}");
+    }
+}
+
+#[test]
+fn all_push_one_another_and_obstacles_stay() {
+    // Pairs that overlap by 0.01, so the force is 1 and a step moves 0.01: predator and obstacle, predator and prey,
+    // obstacle and prey, prey and prey.
+    let mut environment = PredatorPrey::new(2, 4, Plain, EnvironmentOptions::default());
+    let places = [
+        [[0.0, 0.0], [0.0, 10.0]].as_slice(),
+        &[[0.265, 0.0], [0.0, 20.0]],
+        &[[0.115, 10.0], [0.24, 20.0], [0.0, 30.0], [0.09, 30.0]],
+    ]
+    .concat();
+    environment.world.place(&places);
+    // Without the prey's rule.
+    environment.world.set_forces(&[0, 0]);
+    environment.world.advance();
+    let pushes = [-0.01, -0.01, 0.0, 0.0, 0.01, 0.01, -0.01, 0.01];
+    for (entity, (body, (from, push))) in
+        environment.world.bodies.iter().zip(places.iter().zip(pushes)).enumerate()
+    {
+        let moved = [body.position[0] - from[0], body.position[1] - from[1]];
+        assert!((moved[0] - push).abs() < 1e-5 && moved[1] == 0.0, "{entity}: {moved:?}");
+    }
+}
