@@ -2,6 +2,7 @@
 
 use crate::logging::LogOptions;
 use clap::{Args, Parser, Subcommand, ValueEnum, builder::TypedValueParser as _};
+use rit_learner::run_handle::EPISODES_MAX;
 use rit_proto::transport::{Address, CredentialFiles, Credentials, CredentialsError};
 use std::{fmt, path::PathBuf};
 
@@ -190,7 +191,7 @@ pub struct EvaluateOptions {
     #[arg(long, value_delimiter = ',', default_value = "training")]
     pub tasks: Vec<String>,
     /// Episodes of each task; without it the run's own number
-    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=i64::from(EPISODES_MAX)))]
     pub episodes: Option<u32>,
     /// Seed of the evaluation; without it one that follows from the run's
     #[arg(long)]
@@ -368,7 +369,7 @@ pub enum CtlCommand {
         #[arg(long, value_delimiter = ',', default_value = "training")]
         tasks: Vec<String>,
         /// Episodes of each task; without it the run's own number
-        #[arg(long, value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+        #[arg(long, value_parser = clap::value_parser!(u32).range(1..=i64::from(EPISODES_MAX)))]
         episodes: Option<u32>,
         /// Seed of the evaluation; without it one that follows from the run's
         #[arg(long)]

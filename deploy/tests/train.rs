@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{RunFolder, json_lines, pids, shared_memory_of, wait_until_gone};
+use common::{RunFolder, Train, json_lines, pids, shared_memory_of, wait_until_gone};
 use rustix::process::Signal;
 use serde_json::Value;
 use std::os::unix::fs::PermissionsExt as _;
@@ -68,6 +68,29 @@ fn the_same_seed_gives_the_same_weights_whoever_rolls() {
     assert_ne!(alone.0, digest(&["--actors", "1", "--seed", "4"]).0, "another seed");
 }
 
+/// Batches of eight episodes: one actor rolls them side by side, three in shares of three, and with
+/// `actors.episodes_at_once=1` one after another.
+#[test]
+fn the_same_seed_gives_the_same_weights_however_many_episodes_are_rolled_side_by_side() {
+    let digest = |arguments: &[&str]| {
+        let settings = [
+            "cooperative-navigation",
+            "--steps",
+            "3000",
+            "--set",
+            "algorithm.batch_size=8",
+            "--set",
+            "evaluation.episodes=1",
+        ];
+        let summary = RunFolder::new().train(&[&settings, arguments].concat());
+        assert_eq!(summary["updates"], Value::from(15), "one for each batch");
+        summary["weights_digest"].clone()
+    };
+    let together = digest(&["--actors", "1"]);
+    assert_eq!(together, digest(&["--actors", "3"]));
+    assert_eq!(together, digest(&["--actors", "1", "--set", "actors.episodes_at_once=1"]));
+}
+
 #[test]
 fn ctrl_c_ends_everything_in_order() {
     for signal in [Signal::INT, Signal::TERM] {
@@ -99,9 +122,19 @@ fn nothing_outlives_a_killed_supervisor() {
 #[test]
 fn an_early_stop_ends_at_an_evaluation() {
     let until = ["--until", "win_rate=0.25", "--set", "evaluation.every_env_steps=100"];
-    let summary =
-        RunFolder::new().train(&[&["matrix-game", "--steps", "20000", "--seed", "1"][..], &until].concat());
+    let folder = RunFolder::new();
+    let summary = folder.train(&[&["matrix-game", "--steps", "20000", "--seed", "1"][..], &until].concat());
     assert!(summary["env_steps"].as_u64() < Some(20_000), "{summary}");
     let results = summary["evaluation"].as_object().unwrap();
     assert!(results.values().all(|result| result["win_rate"].as_f64() >= Some(0.25)), "{summary}");
+
+    // It stays over, until more is asked for.
+    let again = Train::resume(&folder, &[]).finish();
+    assert_eq!(
+        (&again["env_steps"], &again["weights_digest"]),
+        (&summary["env_steps"], &summary["weights_digest"])
+    );
+    let steps = summary["env_steps"].as_u64().unwrap() + 100;
+    let further = Train::resume(&folder, &["--until", "mean_return=1000", "--steps", &steps.to_string()]);
+    assert_eq!(further.finish()["env_steps"], Value::from(steps));
 }

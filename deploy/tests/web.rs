@@ -219,7 +219,7 @@ fn what_is_asked_is_answered_and_nonsense_is_refused() {
     for (path, body, status, message) in [
         ("/api/evaluate", json!({ "tasks": ["chess"] }), 400, "unknown task \"chess\"; known: game-1"),
         ("/api/evaluate", json!({ "tasks": ["testing"] }), 400, "matrix-game has no such tasks"),
-        ("/api/evaluate", json!({ "tasks": [], "episodes": 1_000_000 }), 400, "at most 10000"),
+        ("/api/evaluate", json!({ "tasks": [], "episodes": 1_000_001 }), 400, "at most 1000000"),
         ("/api/evaluate", json!({ "task": "game-1" }), 422, "unknown field"),
         ("/api/watch", json!({ "task": "x".repeat(5000), "number": 0 }), 413, "limit"),
         ("/api/watch", json!({ "task": "game-1", "number": -1 }), 422, "number"),

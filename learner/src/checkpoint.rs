@@ -23,7 +23,7 @@ use crate::{
     weights_file::{self, WeightsFileError},
 };
 use rit_algo::Rit;
-use rit_config::{Algorithm, RunDir};
+use rit_config::{Algorithm, OptimizerName, RunDir};
 use rit_episode::{Episode, wire::Expected};
 use safetensors::{Dtype, SafeTensorError, SafeTensors, tensor::TensorView};
 use sha2::{Digest as _, Sha256};
@@ -278,9 +278,10 @@ fn load(
         let params = tensor(&snapshot_name(*version), rit.acting().len())?;
         snapshots.push(Snapshot::new(*version, *env_steps, &params));
     }
-    // RMSprop has no mean.
-    let mean_len =
-        if tensors.tensor(MEAN).is_ok_and(|mean| mean.data().is_empty()) { 0 } else { params.len() };
+    let mean_len = match algorithm.optimizer {
+        OptimizerName::Adam => params.len(),
+        OptimizerName::RmsProp => 0,
+    };
     Ok(TrainingState {
         target: tensor(TARGET, rit.target().len())?,
         mean: tensor(MEAN, mean_len)?,

@@ -152,9 +152,11 @@ impl From<AskError> for Status {
         let message = error.to_string();
         match error {
             AskError::Over => Self::unavailable(message),
-            AskError::Task(_) | AskError::NoTasks(_) | AskError::Setting(_) | AskError::Log(_) => {
-                Self::invalid_argument(message)
-            }
+            AskError::Task(_)
+            | AskError::NoTasks(_)
+            | AskError::Episodes(_)
+            | AskError::Setting(_)
+            | AskError::Log(_) => Self::invalid_argument(message),
             AskError::Checkpoint(_) | AskError::Rollout(_) | AskError::RunDir(_) => Self::internal(message),
         }
     }

@@ -17,6 +17,9 @@ use tokio::{
     task::JoinError,
 };
 
+/// Most episodes of each task that one evaluation rolls.
+pub const EPISODES_MAX: u32 = 1_000_000;
+
 /// Changes what this process logs, or says why it cannot.
 pub type SetLog = Arc<dyn Fn(&str) -> Result<(), String> + Send + Sync>;
 
@@ -32,6 +35,9 @@ pub enum AskError {
     /// A split without tasks.
     #[error("{0} has no such tasks")]
     NoTasks(TaskSet),
+    /// More episodes than anybody would wait for.
+    #[error("{0} episodes of a task are too many: at most {EPISODES_MAX}")]
+    Episodes(u32),
     /// A setting that cannot be.
     #[error(transparent)]
     Setting(#[from] ConfigError),
@@ -145,7 +151,7 @@ impl RunHandle {
     /// Greedy episodes with the newest weights, while training goes on.
     ///
     /// # Errors
-    /// When there are no such tasks.
+    /// When there are no such tasks, or too many episodes are asked for.
     pub async fn evaluate(&self, request: v1::EvaluateRequest) -> Result<v1::Evaluation, AskError> {
         let v1::EvaluateRequest { tasks, episodes, seed } = request;
         let config = self.config();
@@ -154,9 +160,10 @@ impl RunHandle {
         if tasks.is_empty() {
             return Err(AskError::NoTasks(config.environment.task_set));
         }
-        let episodes = match episodes as usize {
+        let episodes = match episodes {
             0 => config.evaluation.episodes,
-            episodes => episodes,
+            1..=EPISODES_MAX => episodes as usize,
+            _ => return Err(AskError::Episodes(episodes)),
         };
         let seed = seed.map_or_else(|| evaluation_seed(&config), RunSeed);
         self.roll(move |acting, snapshot| {

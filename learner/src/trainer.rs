@@ -241,7 +241,7 @@ impl Trainer {
         if self.standing.evaluation.is_none() {
             self.evaluate()?;
         }
-        let mut over = self.standing.progress.env_steps >= self.config.training.t_max;
+        let mut over = self.is_over();
         while !over && let Ok(work) = work.recv() {
             match work {
                 Work::Batch(episodes) => {
@@ -266,7 +266,8 @@ impl Trainer {
                     let _ = answer.send(Checkpointed { progress, weights_digest, written });
                 }
                 Work::Set(config) => {
-                    let other_result = self.config.algorithm != config.algorithm;
+                    let other_result = self.config.algorithm != config.algorithm
+                        || self.config.evaluation != config.evaluation;
                     self.config = Config::clone(&config);
                     if other_result {
                         // What was trained so far is not trained again under other settings.
@@ -325,24 +326,22 @@ impl Trainer {
             };
             self.measured(&line)?;
         }
-        let mut over = after.env_steps >= self.config.training.t_max;
         if self.is_due(self.config.evaluation.every_env_steps) {
-            let results = self.evaluate()?;
-            over |= self.reached(&results);
+            self.evaluate()?;
         }
-        Ok(over)
+        Ok(self.is_over())
     }
 
     /// The scheduled evaluation of the training tasks: always the same episodes, so that one curve's points
     /// differ by the weights alone.
-    fn evaluate(&mut self) -> Result<Vec<TaskResult>, TrainError> {
+    fn evaluate(&mut self) -> Result<(), TrainError> {
         let progress = self.standing.progress;
         let results = self.greedy(self.config.evaluation.episodes);
         let line = Line::Evaluation { progress, wall_s: self.metrics.wall_s(), tasks: by_task(&results) };
         self.measured(&line)?;
         tracing::info!(env_steps = progress.env_steps, results = %in_words(&results), "evaluated");
-        self.standing.evaluation = Some((progress, results.clone()));
-        Ok(results)
+        self.standing.evaluation = Some((progress, results));
+        Ok(())
     }
 
     fn measured(&mut self, line: &Line) -> Result<(), TrainError> {
@@ -355,6 +354,14 @@ impl Trainer {
         let mut acting = Acting::new(Arc::clone(&self.rit), &self.update.params[self.rit.acting()]);
         let tasks = self.config.environment.task_set.tasks(Split::Training);
         self.evaluator.evaluate(&mut acting, &tasks, episodes, evaluation_seed(&self.config))
+    }
+
+    /// Whether all steps are done, or an evaluation made just now says that it is enough. What a checkpoint holds
+    /// counts: a run that was over when it was saved is over when it is loaded.
+    fn is_over(&self) -> bool {
+        let Standing { progress, evaluation, .. } = &self.standing;
+        let reached = |(at, results): &(Progress, Vec<TaskResult>)| at == progress && self.reached(results);
+        progress.env_steps >= self.config.training.t_max || evaluation.as_ref().is_some_and(reached)
     }
 
     fn reached(&self, results: &[TaskResult]) -> bool {

@@ -153,7 +153,8 @@ const FREE: [&str; 10] = [
     "web",
 ];
 
-/// Keys that a running learner can change. Of these only `algorithm.epsilon_finish` changes the result.
+/// Keys that a running learner can change. Of these `algorithm.epsilon_finish` changes the
+/// result, and `evaluation` does where `training.until` ends the run at an evaluation.
 const LIVE: [&str; 7] = [
     "algorithm.epsilon_finish",
     "evaluation.every_env_steps",

@@ -147,17 +147,25 @@ mod tests {
             (128, 192),
             (64, 192),
             (148, 64),
+            (64, 4),
             (64, 5),
+            (64, 6),
             (64, 20),
             (9, 8),
             (192, 192),
         ] {
-            let (x, w, start) = (noise(1, 300 * inputs), noise(2, outputs * inputs), noise(3, 300 * outputs));
-            for accum in [Accum::Replace, Accum::Add] {
+            // By themselves, and as columns of wider matrices, both of them.
+            for (accum, margin) in
+                [(Accum::Replace, 0), (Accum::Add, 0), (Accum::Replace, 20), (Accum::Add, 20)]
+            {
+                let width = inputs + margin;
+                let (x, w) = (noise(1, 300 * width), noise(2, outputs * width));
+                let start = noise(3, 300 * outputs);
                 let run = |first: usize, rows: usize| {
                     let mut y = start[first * outputs..(first + rows) * outputs].to_vec();
-                    let x = View::dense(&x[first * inputs..(first + rows) * inputs], inputs);
-                    x_wt(x, View::dense(&w, inputs), ViewMut::dense(&mut y, outputs), accum);
+                    let x = View::dense(&x[first * width..(first + rows) * width], width);
+                    let w = View::dense(&w, width).columns(margin..width);
+                    x_wt(x.columns(0..inputs), w, ViewMut::dense(&mut y, outputs), accum);
                     y
                 };
                 let all = run(0, 300);
@@ -167,7 +175,7 @@ mod tests {
                     let part = run(first, rows);
                     assert!(
                         part == all[first * outputs..(first + rows) * outputs],
-                        "{inputs} {outputs} {rows}"
+                        "{inputs} {outputs} {rows} {margin}"
                     );
                 }
             }

@@ -44,12 +44,16 @@ impl Scratch {
 }
 
 impl Buffer {
-    /// Makes it exactly this long. It holds whatever it held before: to be written whole before it is read.
+    /// Makes it exactly this long. It holds whatever it held before: to be written whole before it is read. Debug
+    /// builds fill it with nonsense, so that tests notice what is read too early.
     pub fn fit(&mut self, len: usize) -> &mut [f32] {
         if self.memory.len() < len {
             self.memory.resize(len, 0.0);
         }
         self.len = len;
+        if cfg!(debug_assertions) {
+            self.fill(1e30);
+        }
         self
     }
 }

@@ -26,9 +26,6 @@ use std::{
 /// Bytes of the end of a log that are shown.
 const LOG_BYTES: u64 = 32 << 10;
 
-/// Most episodes of each task that one evaluation rolls.
-const EPISODES_MAX: u32 = 10_000;
-
 pub fn router() -> Router<Page> {
     Router::new()
         .route("/api/run", get(run))
@@ -61,8 +58,6 @@ pub enum ApiError {
     TooSlow,
     #[error("{}", .0.body_text())]
     Body(#[from] JsonRejection),
-    #[error("{0} episodes are too many: at most {EPISODES_MAX}")]
-    Episodes(u32),
     #[error(transparent)]
     Ask(#[from] AskError),
     #[error("{0}")]
@@ -77,11 +72,14 @@ impl IntoResponse for ApiError {
             Self::NotFound => StatusCode::NOT_FOUND,
             Self::TooSlow => StatusCode::GATEWAY_TIMEOUT,
             Self::Body(rejection) => rejection.status(),
-            Self::Episodes(_) | Self::Ask(AskError::Task(_) | AskError::NoTasks(_)) => {
-                StatusCode::BAD_REQUEST
-            }
             Self::Ask(AskError::Over) => StatusCode::SERVICE_UNAVAILABLE,
-            Self::Ask(AskError::Setting(_) | AskError::Log(_)) => StatusCode::BAD_REQUEST,
+            Self::Ask(
+                AskError::Task(_)
+                | AskError::NoTasks(_)
+                | AskError::Episodes(_)
+                | AskError::Setting(_)
+                | AskError::Log(_),
+            ) => StatusCode::BAD_REQUEST,
             Self::Ask(AskError::Checkpoint(_) | AskError::Rollout(_) | AskError::RunDir(_)) | Self::Io(_) => {
                 StatusCode::INTERNAL_SERVER_ERROR
             }
@@ -157,9 +155,6 @@ async fn evaluate(
     body: Result<Json<Evaluate>, JsonRejection>,
 ) -> Result<Json<v1::Evaluation>, ApiError> {
     let Json(Evaluate { tasks, episodes }) = body?;
-    if episodes > EPISODES_MAX {
-        return Err(ApiError::Episodes(episodes));
-    }
     Ok(Json(page.handle.evaluate(v1::EvaluateRequest { tasks, episodes, seed: None }).await?))
 }
 
