@@ -4,8 +4,8 @@ use std::ops::RangeInclusive;
 
 /// Frames one sender may have on the way, by default as many as take [`SENDER_BYTES`]: enough that the learner, while a
 /// sender sleeps that was ahead, does not run dry and sleep too, and few enough to stay in a core's cache. With frames of
-/// 64 KiB, 8, 16, 20, 24, 32 and 64 of them, a frame cost both sides together 17.4, 13.8, 13.0, 13.5, 13.7 and 14.7 µs.
-/// Frames that take longer to copy than a sender sleeps do with fewer.
+/// 64 KiB, 8, 16, 20, 24, 32 and 64 of them, a frame cost both sides together 17.4, 13.8, 13.0, 13.5, 13.7 and 14.7 µs
+/// (8, 16 and 64 on other days, when 32 took 13.2). Frames that take longer to copy than a sender sleeps do with fewer.
 const FRAMES_PER_SENDER: RangeInclusive<usize> = 8..=32;
 const SENDER_BYTES: usize = 5 << 18;
 
