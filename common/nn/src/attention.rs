@@ -57,7 +57,7 @@ pub struct AttentionState {
     queries: Buffer,
     /// Keys and ReLU'd values, `[K, 2a]`.
     key_values: Buffer,
-    /// Softmax weights; the groups' `[heads, queries, keys]` one after another.
+    /// Softmax weights; the groups' `[heads, queries, masks, keys]` one after another.
     weights: Buffer,
 }
 
@@ -90,16 +90,28 @@ impl Attention {
         state: &mut AttentionState,
         out: ViewMut<'_>,
     ) {
+        self.attend_masks(groups, &[visible], state, out);
+    }
+
+    /// The same queries under several masks, which share their projections and their scores. With M masks, row
+    /// `q M + i` of `out` (Q M, a) is query q's under mask i.
+    pub fn attend_masks(
+        &self,
+        groups: &[Group],
+        masks: &[Visible<'_>],
+        state: &mut AttentionState,
+        out: ViewMut<'_>,
+    ) {
         let AttentionState { queries, key_values, weights } = state;
         let pairs: usize = groups.iter().map(Group::pairs).sum();
-        let weights = weights.fit(pairs * self.heads);
+        let weights = weights.fit(pairs * masks.len() * self.heads);
         let queries = View::dense(queries, self.dim);
-        score(queries, key_values, groups, visible, weights, self.head_dim());
+        score(queries, key_values, groups, masks, weights, self.head_dim());
         exponentiate(weights);
         attend(key_values, groups, weights, out, self.head_dim());
     }
 
-    /// Takes `d_out` (Q, a). Writes `dx_queries` (Q, h) and `dx_keys` (K, h) and adds to the parameters'
+    /// Takes `d_out` (Q M, a). Writes `dx_queries` (Q, h) and `dx_keys` (K, h) and adds to the parameters'
     /// gradients.
     #[allow(clippy::too_many_arguments, reason = "a matrix and its companions, each named")]
     pub fn backward(
@@ -146,27 +158,31 @@ fn scale(head_dim: usize) -> f32 {
 }
 
 vectorized! {
-    /// Every query's scores less the largest of them, group by group and head by head; −∞ where unseen.
+    /// Every query's scores under every mask less the largest of them, group by group and head by head; −∞ where
+    /// unseen.
     fn score<'a>(
         queries: View<'a>,
         key_values: &'a [f32],
         groups: &'a [Group],
-        visible: Visible<'a>,
+        masks: &'a [Visible<'a>],
         scores: &'a mut [f32],
         head_dim: usize,
     ) {
+        let mut first = 0;
         for group in groups {
-            let pairs = group.pairs();
+            let pairs = first..first + group.pairs();
+            first = pairs.end;
             let (keys, _) = keys_and_values(key_values, group, queries.cols);
             let queries = queries.rows(group.queries.clone());
-            let seen = visible.take(pairs);
             for head in heads(queries.cols, head_dim) {
-                let scores = take(&mut scores, pairs);
-                dots(queries.columns(head.clone()), keys.columns(head), scores);
+                let scores = take(&mut scores, pairs.len() * masks.len());
+                dots(queries.columns(head.clone()), keys.columns(head), &mut scores[..pairs.len()]);
+                repeat_rows(scores, keys.rows, masks.len());
                 for (at, scores) in scores.chunks_exact_mut(keys.rows).enumerate() {
+                    let (query, seen) = (at / masks.len(), masks[at % masks.len()].flags(&pairs));
                     let mut largest = f32::NEG_INFINITY;
                     for (key, score) in scores.iter_mut().enumerate() {
-                        let sees = seen.is_none_or(|seen| seen[at * keys.rows + key] != 0);
+                        let sees = seen.is_none_or(|seen| seen[query * keys.rows + key] != 0);
                         *score = if sees { scale(head_dim) * *score } else { f32::NEG_INFINITY };
                         largest = largest.max(*score);
                     }
@@ -198,10 +214,11 @@ vectorized! {
         out: ViewMut<'a>,
         head_dim: usize,
     ) {
+        let masks = masks(groups, out.rows);
         for group in groups {
             let (_, values) = keys_and_values(key_values, group, out.cols);
             for head in heads(out.cols, head_dim) {
-                let weights = take(&mut weights, group.pairs());
+                let weights = take(&mut weights, group.pairs() * masks);
                 for weights in weights.chunks_exact_mut(values.rows) {
                     let total: f32 = weights.iter().sum();
                     // Who sees nothing keeps the zeros.
@@ -209,7 +226,7 @@ vectorized! {
                         weights.iter_mut().for_each(|weight| *weight /= total);
                     }
                 }
-                let out = out.reborrow().rows(group.queries.clone()).columns(head.clone());
+                let out = out.reborrow().rows(under_masks(group, masks)).columns(head.clone());
                 blend(weights, values.columns(head), out);
             }
         }
@@ -232,14 +249,15 @@ vectorized! {
         let a = queries.cols;
         let (d_queries, d_key_values) = d;
         let mut d_scores = Buffer::default();
+        let masks = masks(groups, d_out.rows);
         for group in groups {
             let (keys, values) = keys_and_values(key_values, group, a);
-            let (queries, d_out) = (queries.rows(group.queries.clone()), d_out.rows(group.queries.clone()));
+            let (queries, d_out) = (queries.rows(group.queries.clone()), d_out.rows(under_masks(group, masks)));
             let d_queries = &mut d_queries[group.queries.start * a..group.queries.end * a];
             let d_key_values = &mut d_key_values[group.keys.start * 2 * a..group.keys.end * 2 * a];
-            let d_scores = d_scores.fit(group.pairs());
+            let d_scores = d_scores.fit(group.pairs() * masks);
             for head in heads(a, head_dim) {
-                let (weights_here, behind) = weights.split_at(group.pairs());
+                let (weights_here, behind) = weights.split_at(group.pairs() * masks);
                 weights = behind;
                 let (keys, values) = (keys.columns(head.clone()), values.columns(head.clone()));
                 let (queries, d_out) = (queries.columns(head.clone()), d_out.columns(head.clone()));
@@ -252,6 +270,9 @@ vectorized! {
                         *d_score = weight * (*d_score - mean) * scale(head_dim);
                     }
                 }
+                // Masks share the scores: their gradients meet before the products.
+                sum_repeated_rows(d_scores, keys.rows, masks);
+                let d_scores = &d_scores[..group.pairs()];
                 blend(d_scores, keys, ViewMut::dense(d_queries, a).columns(head.clone()));
                 let d_keys = ViewMut::dense(d_key_values, 2 * a).columns(head.clone());
                 blend_transposed(d_scores, queries, d_keys);
@@ -280,6 +301,44 @@ fn keys_and_values<'a>(key_values: &'a [f32], group: &Group, a: usize) -> (View<
 #[inline(always)]
 fn heads(a: usize, head_dim: usize) -> impl Iterator<Item = Range<usize>> {
     (0..a).step_by(head_dim).map(move |at| at..at + head_dim)
+}
+
+/// How many masks each query stands under, by the rows of the output.
+#[inline(always)]
+fn masks(groups: &[Group], rows: usize) -> usize {
+    rows / groups.last().map_or(1, |group| group.queries.end.max(1))
+}
+
+/// A group's rows of the output.
+#[inline(always)]
+fn under_masks(group: &Group, masks: usize) -> Range<usize> {
+    group.queries.start * masks..group.queries.end * masks
+}
+
+/// Repeats each of the rows that stand at the front, in place, so that all is filled.
+#[inline(always)]
+fn repeat_rows(rows: &mut [f32], width: usize, times: usize) {
+    if times == 1 {
+        return;
+    }
+    // From behind: a row goes to where only rows stood that have gone already.
+    for row in (0..rows.len() / width / times).rev() {
+        for copy in (0..times).rev() {
+            rows.copy_within(row * width..(row + 1) * width, (row * times + copy) * width);
+        }
+    }
+}
+
+/// Leaves each row's sum over its repetitions at the front: the backward of [`repeat_rows`].
+#[inline(always)]
+fn sum_repeated_rows(rows: &mut [f32], width: usize, times: usize) {
+    if times == 1 {
+        return;
+    }
+    for at in 0..rows.len() / times {
+        let (row, column) = (at / width, at % width);
+        rows[at] = (0..times).map(|copy| rows[(row * times + copy) * width + column]).sum();
+    }
 }
 
 /// Queries from which on a group's products are faer's: to smaller ones the call costs more than the loops here.
@@ -347,16 +406,12 @@ fn take<'a>(rest: &mut &'a mut [f32], len: usize) -> &'a mut [f32] {
 }
 
 impl<'a> Visible<'a> {
-    /// The next group's flags, `[queries, keys]`; `None` where all is seen.
+    /// The flags of these pairs, one group's `[queries, keys]`; `None` where all is seen.
     #[inline(always)]
-    fn take(&mut self, pairs: usize) -> Option<&'a [u8]> {
+    fn flags(self, pairs: &Range<usize>) -> Option<&'a [u8]> {
         match self {
             Self::All => None,
-            Self::Where(flags) => {
-                let (front, back) = flags.split_at(pairs);
-                *flags = back;
-                Some(front)
-            }
+            Self::Where(flags) => Some(&flags[pairs.clone()]),
         }
     }
 }

@@ -157,3 +157,40 @@ fn gradients_are_the_numeric_ones() {
         check("keys", &xk, &dxk, |xk| loss(&params, &xq, xk));
     }
 }
+
+/// Three masks over one set of projections: each query's row under a mask is what that mask alone gives, and
+/// gradients are the numeric ones of all three together.
+#[test]
+fn several_masks_are_several_passes() {
+    let first = seen();
+    let third: Vec<u8> = first.iter().enumerate().map(|(at, seen)| seen ^ u8::from(at % 3 == 0)).collect();
+    let masks = [Visible::Where(&first), Visible::All, Visible::Where(&third)];
+    for heads in [1, 2] {
+        let (attention, len) = unit(heads);
+        let (params, xq, xk) = (noise(1, len), noise(2, QUERIES * INPUTS), noise(3, KEYS * INPUTS));
+        let to = noise(4, 3 * QUERIES * DIM);
+        let run_all = |params: &[f32], xq: &[f32], xk: &[f32]| {
+            let (mut out, mut state) = (vec![9.0; 3 * QUERIES * DIM], AttentionState::default());
+            attention.project(params, View::dense(xq, INPUTS), View::dense(xk, INPUTS), &mut state);
+            attention.attend_masks(&groups(), &masks, &mut state, ViewMut::dense(&mut out, DIM));
+            (out, state)
+        };
+        let (out, state) = run_all(&params, &xq, &xk);
+        for (mask, visible) in masks.into_iter().enumerate() {
+            let (alone, _) = run(&attention, &params, &xq, &xk, visible);
+            for query in 0..QUERIES {
+                let row = &out[(query * 3 + mask) * DIM..][..DIM];
+                for (a, b) in row.iter().zip(&alone[query * DIM..]) {
+                    assert!((a - b).abs() < 1e-6, "mask {mask}, query {query}: {a} {b}");
+                }
+            }
+        }
+        let loss = |params: &[f32], xq: &[f32], xk: &[f32]| {
+            run_all(params, xq, xk).0.iter().zip(&to).map(|(out, to)| f64::from(out * to)).sum()
+        };
+        let (dxq, dxk, grads) = backward(&attention, &params, &xq, &xk, &state, &to);
+        check("params", &params, &grads, |params| loss(params, &xq, &xk));
+        check("queries", &xq, &dxq, |xq| loss(&params, xq, &xk));
+        check("keys", &xk, &dxk, |xk| loss(&params, &xq, xk));
+    }
+}
