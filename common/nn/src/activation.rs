@@ -1,6 +1,10 @@
 //! Activations over whole buffers, each with its backward.
 
-use crate::{View, ViewMut, math, vectorized};
+use crate::{
+    View, ViewMut, for_lanes,
+    math::{self, each, load, store},
+    vectorized,
+};
 
 vectorized! {
     /// y = max(y, 0), in place.
@@ -37,9 +41,51 @@ pub fn elu_slope(y: f32) -> f32 {
     if y > 0.0 { 1.0 } else { y + 1.0 }
 }
 
+vectorized! {
+    /// y = GELU(x) = x Φ(x), Φ the normal distribution's: exact, by the error function. `x` and `y` (rows, columns).
+    pub fn gelu<'a>(x: View<'a>, y: ViewMut<'a>) {
+        debug_assert_eq!((x.rows, x.cols), (y.rows, y.cols));
+        for row in 0..y.rows {
+            let (x, y) = (x.row(row), y.row(row));
+            for_lanes!(0..x.len(), |at, len| {
+                let x = load(x, at, len);
+                store(each(|lane| x[lane] * normal_cdf(x[lane])), y, at, len);
+            });
+        }
+    }
+}
+
+vectorized! {
+    /// dy = dy (Φ(x) + x φ(x)), in place; `x` is what [`gelu`] read.
+    pub fn gelu_backward<'a>(x: View<'a>, dy: ViewMut<'a>) {
+        debug_assert_eq!((x.rows, x.cols), (dy.rows, dy.cols));
+        for row in 0..dy.rows {
+            let (x, dy) = (x.row(row), dy.row(row));
+            for_lanes!(0..x.len(), |at, len| {
+                let (x, d) = (load(x, at, len), load(dy, at, len));
+                store(each(|lane| d[lane] * gelu_slope(x[lane])), dy, at, len);
+            });
+        }
+    }
+}
+
+/// Φ(x).
+#[inline(always)]
+fn normal_cdf(x: f32) -> f32 {
+    0.5 * (1.0 + math::erf(x * std::f32::consts::FRAC_1_SQRT_2))
+}
+
+/// Φ(x) + x φ(x), φ(x) = e^(−x²/2) / √(2π).
+#[inline(always)]
+fn gelu_slope(x: f32) -> f32 {
+    const INVERSE_ROOT_TAU: f32 = 0.398_942_3;
+    normal_cdf(x) + x * (INVERSE_ROOT_TAU * math::exp(-0.5 * x * x))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::gradcheck::{check, noise};
 
     #[test]
     fn relu_and_its_slope() {
@@ -56,5 +102,29 @@ mod tests {
         assert_eq!((elu(2.0), elu_slope(elu(2.0))), (2.0, 1.0));
         assert!((elu(-1.0) + 0.632_120_6).abs() < 1e-6);
         assert!((elu_slope(elu(-1.0)) - 0.367_879_4).abs() < 1e-6);
+    }
+
+    #[test]
+    fn gelu_is_the_exact_one() {
+        let x: Vec<f32> = (-600..=600).map(|step| step as f32 * 0.01).collect();
+        let mut y = vec![0.0; x.len()];
+        gelu(View::dense(&x, x.len()), ViewMut::dense(&mut y, x.len()));
+        for (x, y) in x.iter().map(|&x| f64::from(x)).zip(y) {
+            let exact = 0.5 * x * libm::erfc(-x / std::f64::consts::SQRT_2);
+            assert!((f64::from(y) - exact).abs() < 1e-6, "{x}: {y} {exact}");
+        }
+    }
+
+    #[test]
+    fn gelu_gradients_are_the_numeric_ones() {
+        let (x, to) = (noise(1, 2 * 21), noise(2, 2 * 21));
+        let loss = |x: &[f32]| {
+            let mut y = vec![0.0; x.len()];
+            gelu(View::dense(x, 21), ViewMut::dense(&mut y, 21));
+            y.iter().zip(&to).map(|(y, to)| f64::from(y * to)).sum()
+        };
+        let mut dx = to.clone();
+        gelu_backward(View::dense(&x, 21), ViewMut::dense(&mut dx, 21));
+        check("x", &x, &dx, loss);
     }
 }

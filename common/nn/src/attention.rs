@@ -4,15 +4,15 @@
 //! sees nothing gets zeros, exactly, and passes no gradient.
 
 use crate::{
-    Buffer, LayoutBuilder, Linear, Scratch, View, ViewMut, for_lanes, linear,
+    Buffer, LayoutBuilder, Linear, Scratch, View, ViewMut, activation, for_lanes, linear,
     math::{self, LANES, Lanes, each, load, store},
     matmul, vectorized,
 };
 use faer::Accum;
 use std::ops::Range;
 
-/// Query, key and value layers, h → a, with bias; the value goes through ReLU; heads split a evenly;
-/// score = q·k / √(a / heads).
+/// Query, key and value layers, h → a, with bias; the value goes through ReLU unless it is to stay linear; heads
+/// split a evenly; score = q·k / √(a / heads).
 #[derive(Clone, Debug)]
 pub struct Attention {
     /// h → a.
@@ -23,6 +23,17 @@ pub struct Attention {
     pub heads: usize,
     /// a: size of all heads together.
     pub dim: usize,
+    /// What becomes of a value behind its layer.
+    values: Values,
+}
+
+/// What becomes of a value behind its layer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Values {
+    /// It goes through ReLU (the paper's attention).
+    Rectified,
+    /// Nothing (a transformer's attention).
+    Linear,
 }
 
 /// Queries that look at the same keys.
@@ -55,7 +66,7 @@ pub enum Visible<'a> {
 pub struct AttentionState {
     /// `[Q, a]`.
     queries: Buffer,
-    /// Keys and ReLU'd values, `[K, 2a]`.
+    /// Keys and values, `[K, 2a]`.
     key_values: Buffer,
     /// Softmax weights; the groups' `[heads, queries, masks, keys]` one after another.
     weights: Buffer,
@@ -67,7 +78,12 @@ impl Attention {
         let query = Linear::new(layout, &format!("{name}.query"), inputs, dim);
         let (key, value) = (format!("{name}.key"), format!("{name}.value"));
         let key_value = Linear::side_by_side(layout, inputs, &[(&key, dim), (&value, dim)]);
-        Self { query, key_value, heads, dim }
+        Self { query, key_value, heads, dim, values: Values::Rectified }
+    }
+
+    /// The same without ReLU on the values.
+    pub fn linear(layout: &mut LayoutBuilder, name: &str, inputs: usize, dim: usize, heads: usize) -> Self {
+        Self { values: Values::Linear, ..Self::new(layout, name, inputs, dim, heads) }
     }
 
     /// Queries, keys (without their bias) and values of all rows. `x_queries` (Q, h), `x_keys` (K, h).
@@ -79,7 +95,11 @@ impl Attention {
         matmul::x_wt(x_keys, self.key_value.weight(params), key_values.reborrow(), Accum::Replace);
         // The key's bias adds the same to all scores of a query, which softmax does not see: it is left out, and
         // its gradient is zero.
-        linear::add_row_relu(key_values.columns(a..2 * a), &self.key_value.bias(params)[a..]);
+        let (values, bias) = (key_values.columns(a..2 * a), &self.key_value.bias(params)[a..]);
+        match self.values {
+            Values::Rectified => linear::add_row_relu(values, bias),
+            Values::Linear => linear::add_row(values, bias),
+        }
     }
 
     /// Writes `out` (Q, a) from what [`Attention::project`] left.
@@ -133,6 +153,10 @@ impl Attention {
         let (mut d_queries, mut d_key_values) = (scratch.take(queries.len()), scratch.take(key_values.len()));
         let d = (&mut d_queries[..], &mut d_key_values[..]);
         attend_backward(d_out, View::dense(queries, a), key_values, groups, weights, d, self.head_dim());
+        if self.values == Values::Rectified {
+            let values = View::dense(key_values, 2 * a).columns(a..2 * a);
+            activation::relu_backward(values, ViewMut::dense(&mut d_key_values, 2 * a).columns(a..2 * a));
+        }
         self.query.backward(params, x_queries, View::dense(&d_queries, a), Some(dx_queries), grads);
         let d_key_values_view = View::dense(&d_key_values, 2 * a);
         linear::add_column_sums(
@@ -236,7 +260,7 @@ vectorized! {
 vectorized! {
     /// From the gradient by the output to those by queries and by keys and values: `d`, all of it written. With w
     /// the weights: d_w = d_out valueᵀ, d_score = w (d_w − Σ w d_w), d_query = d_score key, d_key = d_scoreᵀ query
-    /// and d_value = wᵀ d_out where ReLU let it pass.
+    /// and d_value = wᵀ d_out.
     fn attend_backward<'a>(
         d_out: View<'a>,
         queries: View<'a>,
@@ -276,14 +300,8 @@ vectorized! {
                 blend(d_scores, keys, ViewMut::dense(d_queries, a).columns(head.clone()));
                 let d_keys = ViewMut::dense(d_key_values, 2 * a).columns(head.clone());
                 blend_transposed(d_scores, queries, d_keys);
-                let mut d_values =
-                    ViewMut::dense(d_key_values, 2 * a).columns(a + head.start..a + head.end);
-                blend_transposed(weights_here, d_out, d_values.reborrow());
-                for key in 0..values.rows {
-                    for (d_value, value) in d_values.row(key).iter_mut().zip(values.row(key)) {
-                        *d_value = if *value > 0.0 { *d_value } else { 0.0 };
-                    }
-                }
+                let d_values = ViewMut::dense(d_key_values, 2 * a).columns(a + head.start..a + head.end);
+                blend_transposed(weights_here, d_out, d_values);
             }
         }
     }

@@ -9,8 +9,10 @@
 
 pub mod activation;
 pub mod attention;
+pub mod categorical;
 pub mod gradcheck;
 pub mod gru;
+pub mod layer_norm;
 pub mod layout;
 pub mod linear;
 pub mod math;
@@ -21,7 +23,8 @@ mod view;
 
 pub use attention::Attention;
 pub use gru::Gru;
-pub use layout::{Layout, LayoutBuilder, Param};
+pub use layer_norm::LayerNorm;
+pub use layout::{Initial, Layout, LayoutBuilder, Param};
 pub use linear::Linear;
 pub use optimizer::{Optimizer, OptimizerKind};
 pub use scratch::{Buffer, Scratch};

@@ -27,6 +27,15 @@ fn unit(heads: usize) -> (Attention, usize) {
     (attention, layout.len())
 }
 
+/// With any number of heads that split the attention, with ReLU on the values and without.
+fn units() -> impl Iterator<Item = (Attention, usize)> {
+    [1, 2, 3].into_iter().flat_map(|heads| {
+        let (attention, len) = unit(heads);
+        let linear = Attention::linear(&mut LayoutBuilder::default(), "attention", INPUTS, DIM, heads);
+        [(attention, len), (linear, len)]
+    })
+}
+
 fn run(
     attention: &Attention,
     params: &[f32],
@@ -65,8 +74,11 @@ fn reference(attention: &Attention, params: &[f32], xq: &[f32], xk: &[f32], seen
                 let keys =
                     || group.keys.clone().zip(flags).filter(|(_, seen)| **seen == 1).map(|(key, _)| key);
                 let total: f32 = keys().map(weight).sum();
-                let sum: f32 =
-                    keys().map(|key| weight(key) * kv[key * 2 * DIM + DIM + column].max(0.0)).sum();
+                let value = |key: usize| match attention.values {
+                    Values::Rectified => kv[key * 2 * DIM + DIM + column].max(0.0),
+                    Values::Linear => kv[key * 2 * DIM + DIM + column],
+                };
+                let sum: f32 = keys().map(|key| weight(key) * value(key)).sum();
                 out[query * DIM + column] = if total > 0.0 { sum / total } else { 0.0 };
             }
         }
@@ -75,15 +87,14 @@ fn reference(attention: &Attention, params: &[f32], xq: &[f32], xk: &[f32], seen
 }
 
 #[test]
-fn follows_the_equations_with_any_number_of_heads() {
-    for heads in [1, 2, 3] {
-        let (attention, len) = unit(heads);
+fn follows_the_equations() {
+    for (attention, len) in units() {
         let (params, xq, xk) = (noise(1, len), noise(2, QUERIES * INPUTS), noise(3, KEYS * INPUTS));
         let (all, seen) = (vec![1; seen().len()], seen());
         for (visible, seen) in [(Visible::All, &all), (Visible::Where(&seen), &seen)] {
             let (out, _) = run(&attention, &params, &xq, &xk, visible);
             for (a, b) in out.iter().zip(reference(&attention, &params, &xq, &xk, seen)) {
-                assert!((a - b).abs() < 1e-5, "{heads} heads: {a} {b}");
+                assert!((a - b).abs() < 1e-5, "{attention:?}: {a} {b}");
             }
         }
     }
@@ -142,8 +153,8 @@ fn what_weighs_next_to_nothing_weighs_nothing() {
 #[test]
 fn gradients_are_the_numeric_ones() {
     let seen = seen();
-    for (heads, visible) in [(1, Visible::All), (2, Visible::Where(&seen)), (3, Visible::All)] {
-        let (attention, len) = unit(heads);
+    for (attention, len) in units() {
+        let visible = if attention.heads == 2 { Visible::Where(&seen) } else { Visible::All };
         let (params, xq, xk, to) =
             (noise(1, len), noise(2, QUERIES * INPUTS), noise(3, KEYS * INPUTS), noise(4, QUERIES * DIM));
         let loss = |params: &[f32], xq: &[f32], xk: &[f32]| {
