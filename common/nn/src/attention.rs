@@ -177,7 +177,7 @@ impl Attention {
 
 /// What a score is scaled with: 1/√(a / heads).
 #[inline(always)]
-fn scale(head_dim: usize) -> f32 {
+pub(crate) fn scale(head_dim: usize) -> f32 {
     1.0 / (head_dim as f32).sqrt()
 }
 
@@ -222,7 +222,7 @@ vectorized! {
 
 vectorized! {
     /// Shares of a softmax before their division, in place.
-    fn exponentiate<'a>(x: &'a mut [f32]) {
+    pub(crate) fn exponentiate<'a>(x: &'a mut [f32]) {
         for x in x {
             *x = math::exp_share(*x);
         }
@@ -309,7 +309,7 @@ vectorized! {
 
 /// One group's keys and values, (keys, a) each.
 #[inline(always)]
-fn keys_and_values<'a>(key_values: &'a [f32], group: &Group, a: usize) -> (View<'a>, View<'a>) {
+pub(crate) fn keys_and_values<'a>(key_values: &'a [f32], group: &Group, a: usize) -> (View<'a>, View<'a>) {
     let both = View { data: key_values, rows: key_values.len() / (2 * a), cols: 2 * a, stride: 2 * a };
     let both = both.rows(group.keys.clone());
     (both.columns(0..a), both.columns(a..2 * a))
@@ -317,7 +317,7 @@ fn keys_and_values<'a>(key_values: &'a [f32], group: &Group, a: usize) -> (View<
 
 /// Each head's columns.
 #[inline(always)]
-fn heads(a: usize, head_dim: usize) -> impl Iterator<Item = Range<usize>> {
+pub(crate) fn heads(a: usize, head_dim: usize) -> impl Iterator<Item = Range<usize>> {
     (0..a).step_by(head_dim).map(move |at| at..at + head_dim)
 }
 
@@ -406,7 +406,7 @@ fn blend_transposed(pairs: &[f32], a: View<'_>, mut b: ViewMut<'_>) {
 
 /// Σ weights[i · stride] · row i, in the `len` columns from `at` on.
 #[inline(always)]
-fn weighted_sum(weights: &[f32], stride: usize, rows: View<'_>, at: usize, len: usize) -> Lanes {
+pub(crate) fn weighted_sum(weights: &[f32], stride: usize, rows: View<'_>, at: usize, len: usize) -> Lanes {
     let mut sum = [0.0; LANES];
     for (row, &weight) in weights.iter().step_by(stride).enumerate() {
         let x = load(rows.row(row), at, len);
@@ -417,7 +417,7 @@ fn weighted_sum(weights: &[f32], stride: usize, rows: View<'_>, at: usize, len: 
 
 /// Splits the next `len` elements off the front.
 #[inline(always)]
-fn take<'a>(rest: &mut &'a mut [f32], len: usize) -> &'a mut [f32] {
+pub(crate) fn take<'a>(rest: &mut &'a mut [f32], len: usize) -> &'a mut [f32] {
     let (front, back) = std::mem::take(rest).split_at_mut(len);
     *rest = back;
     front
@@ -426,7 +426,7 @@ fn take<'a>(rest: &mut &'a mut [f32], len: usize) -> &'a mut [f32] {
 impl<'a> Visible<'a> {
     /// The flags of these pairs, one group's `[queries, keys]`; `None` where all is seen.
     #[inline(always)]
-    fn flags(self, pairs: &Range<usize>) -> Option<&'a [u8]> {
+    pub(crate) fn flags(self, pairs: &Range<usize>) -> Option<&'a [u8]> {
         match self {
             Self::All => None,
             Self::Where(flags) => Some(&flags[pairs.clone()]),

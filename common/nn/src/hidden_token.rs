@@ -1,0 +1,386 @@
+//! A transformer's block over entity tokens and one recurrent token per agent (UPDeT): what an agent remembers is a
+//! token among those it sees.
+//!
+//! An agent's tokens are the entities it sees and its hidden token, which is what the block made of the hidden token
+//! one time before, zeros at first. Two of them ask: the agent's own, whose output is the block's, and the hidden
+//! token, whose output is the next one. Only the latter is recurrent; queries, keys and values of entities depend on
+//! neither agent nor time before, and the agents' own rows wait until all hidden tokens are there: both are products
+//! over all times at once.
+
+mod attend;
+
+use crate::{
+    Attention, Buffer, LayoutBuilder, Scratch, View, ViewMut, activation,
+    attention::{Group, Visible},
+    linear, math, matmul,
+    post_norm::{PostNorm, PostNormState},
+    vectorized,
+};
+use attend::{Tokens, attend, attend_backward};
+use faer::Accum;
+use std::ops::Range;
+
+/// The block: attention with its output layer, feed-forward, norms behind the sums.
+#[derive(Clone, Debug)]
+pub struct HiddenToken {
+    attention: Attention,
+    post_norm: PostNorm,
+}
+
+/// Where the rows of a batch lie: agents' rows are the groups' queries, time after time, and an agent's own token
+/// is the one of the same place among its group's keys.
+#[derive(Clone, Copy, Debug)]
+pub struct Places<'a> {
+    /// Each group's agents (queries) and entities (keys).
+    pub groups: &'a [Group],
+    /// First group of each time, then how many there are.
+    pub group_times: &'a [usize],
+    /// First agent row of each time, then how many there are. The rows of a time go on with a prefix of those of the
+    /// time before.
+    pub agent_times: &'a [usize],
+    /// Which of its group's entities each agent sees. Nobody misses its hidden token.
+    pub visible: Visible<'a>,
+}
+
+/// What forward leaves for backward. With R agent rows and E entity rows; what has 2R rows begins with those of
+/// hidden tokens.
+#[derive(Debug, Default)]
+pub struct HiddenTokenState {
+    /// Who asks: hidden tokens before, and agents' own x, `[2R, h]`.
+    u: Buffer,
+    /// `[2R, a]`.
+    queries: Buffer,
+    /// Keys and ReLU'd values of entities, `[E, 2a]`.
+    entities: Buffer,
+    /// Keys and ReLU'd values of hidden tokens, `[R, 2a]`.
+    hidden: Buffer,
+    /// Softmax weights of hidden tokens; the groups' `[heads, queries, keys + 1]` one after another.
+    hidden_weights: Buffer,
+    /// And of agents' own rows.
+    own_weights: Buffer,
+    /// `[2R, a]`.
+    attended: Buffer,
+    post_norm: PostNormState,
+    /// The block's output, `[2R, h]`: hidden tokens after each step, and agents' own rows.
+    out: Buffer,
+}
+
+impl HiddenToken {
+    /// Declares `{name}.attention`, `.attention_out`, `.attention_norm`, `.feedforward_hidden`, `.feedforward_out` and
+    /// `.feedforward_norm`.
+    pub fn new(
+        layout: &mut LayoutBuilder,
+        name: &str,
+        dim: usize,
+        attention_dim: usize,
+        heads: usize,
+        feedforward_dim: usize,
+    ) -> Self {
+        let attention = Attention::new(layout, &format!("{name}.attention"), dim, attention_dim, heads);
+        let post_norm = PostNorm::new(layout, name, attention_dim, dim, feedforward_dim);
+        Self { attention, post_norm }
+    }
+
+    /// h: columns of x and of the output.
+    pub fn dim(&self) -> usize {
+        self.post_norm.dim()
+    }
+
+    /// From the entities' `x` (E, h) to the state's output. `before` (rows of the first time, h) are the hidden tokens
+    /// before the first time, or zeros.
+    pub fn forward(
+        &self,
+        params: &[f32],
+        places: Places<'_>,
+        x: View<'_>,
+        before: Option<View<'_>>,
+        state: &mut HiddenTokenState,
+    ) {
+        let (h, a) = (self.dim(), self.attention.dim);
+        let rows = places.rows();
+        self.project_entities(params, places, x, state);
+        state.hidden.fit(rows * 2 * a);
+        state.hidden_weights.fit(self.weights(places.groups));
+        state.own_weights.fit(self.weights(places.groups));
+        state.attended.fit(2 * rows * a);
+        state.out.fit(2 * rows * h);
+        self.post_norm.fit(2 * rows, &mut state.post_norm);
+        let (mut pairs, mut weights) = (0, 0);
+        for time in 0..places.times() {
+            let (groups, range) = places.at(time);
+            let previous = if time == 0 { before } else { None };
+            previous_tokens(places, time, previous, state, h);
+            self.project_hidden(params, range.clone(), state);
+            let part = weights..weights + self.weights(groups);
+            let HiddenTokenState { queries, entities, hidden, hidden_weights, attended, .. } = state;
+            let tokens = Tokens { queries: View::dense(&queries[..rows * a], a), entities, hidden };
+            let out = ViewMut::dense(&mut attended[..rows * a], a);
+            attend(
+                tokens,
+                groups,
+                places.visible_from(pairs),
+                &mut hidden_weights[part.clone()],
+                out,
+                self.head_dim(),
+            );
+            weights = part.end;
+            pairs += groups.iter().map(Group::pairs).sum::<usize>();
+            self.finish(params, range, state);
+        }
+        let HiddenTokenState { queries, entities, hidden, own_weights, attended, .. } = state;
+        let tokens = Tokens { queries: View::dense(&queries[rows * a..], a), entities, hidden };
+        let out = ViewMut::dense(&mut attended[rows * a..], a);
+        attend(tokens, places.groups, places.visible, own_weights, out, self.head_dim());
+        self.finish(params, rows..2 * rows, state);
+    }
+
+    /// Takes `d_own` (R, h), the gradient by the agents' own rows. Writes `d_x` (E, h) and adds to the parameters'
+    /// gradients. Hidden tokens before the first time are taken as constant.
+    #[allow(clippy::too_many_arguments, reason = "a matrix and its companions, each named")]
+    pub fn backward(
+        &self,
+        params: &[f32],
+        places: Places<'_>,
+        x: View<'_>,
+        state: &mut HiddenTokenState,
+        d_own: View<'_>,
+        mut d_x: ViewMut<'_>,
+        grads: &mut [f32],
+        scratch: &mut Scratch,
+    ) {
+        let (h, a, rows) = (self.dim(), self.attention.dim, places.rows());
+        let mut d_u = scratch.take(2 * rows * h);
+        let mut d_queries = scratch.take(2 * rows * a);
+        let mut d_attended = scratch.take(2 * rows * a);
+        let mut d_entities = scratch.take_zeros(x.rows * 2 * a);
+        let mut d_hidden = scratch.take(rows * 2 * a);
+        let HiddenTokenState {
+            u,
+            queries,
+            entities,
+            hidden,
+            hidden_weights,
+            own_weights,
+            attended,
+            post_norm,
+            ..
+        } = state;
+        self.post_norm.fit_backward(post_norm);
+
+        // The agents' own rows of all times.
+        let (d_u_hidden, d_u_own) = d_u.split_at_mut(rows * h);
+        let (d_queries_hidden, d_queries_own) = d_queries.split_at_mut(rows * a);
+        let (d_attended_hidden, d_attended_own) = d_attended.split_at_mut(rows * a);
+        self.post_norm.backward(
+            params,
+            rows..2 * rows,
+            post_norm,
+            d_own,
+            ViewMut::dense(d_u_own, h),
+            ViewMut::dense(d_attended_own, a),
+            grads,
+        );
+        let tokens = Tokens { queries: View::dense(&queries[rows * a..], a), entities, hidden };
+        d_hidden.fill(0.0);
+        attend_backward(
+            tokens,
+            places.groups,
+            own_weights,
+            View::dense(d_attended_own, a),
+            [d_queries_own, &mut d_entities, &mut d_hidden],
+            self.head_dim(),
+        );
+
+        // Hidden tokens, from the last time to the first.
+        let mut d_out = scratch.take_zeros(rows * h);
+        let mut weights = hidden_weights.len();
+        let tokens = Tokens { queries: View::dense(&queries[..rows * a], a), entities, hidden };
+        for time in (0..places.times()).rev() {
+            let (groups, range) = places.at(time);
+            let part = weights - self.weights(groups)..weights;
+            weights = part.start;
+            self.post_norm.backward(
+                params,
+                range.clone(),
+                post_norm,
+                View::dense(&d_out, h).rows(range.clone()),
+                ViewMut::dense(d_u_hidden, h).rows(range.clone()),
+                ViewMut::dense(d_attended_hidden, a).rows(range.clone()),
+                grads,
+            );
+            attend_backward(
+                tokens,
+                groups,
+                &hidden_weights[part],
+                View::dense(d_attended_hidden, a),
+                [d_queries_hidden, &mut d_entities, &mut d_hidden],
+                self.head_dim(),
+            );
+            let of_hidden = ViewMut::dense(&mut d_hidden, 2 * a).rows(range.clone());
+            let values = View::dense(hidden, 2 * a).rows(range.clone()).columns(a..2 * a);
+            activation::relu_backward(values, of_hidden.columns(a..2 * a));
+            if time > 0 {
+                let d_queries = View::dense(d_queries_hidden, a).rows(range.clone());
+                let d_hidden = View::dense(&d_hidden, 2 * a).rows(range.clone());
+                let first = places.agent_times[time - 1];
+                let mut d_previous = ViewMut::dense(&mut d_out, h).rows(first..first + range.len());
+                linear::add(d_previous.reborrow(), View::dense(d_u_hidden, h).rows(range.clone()));
+                let weight = self.attention.query.weight(params);
+                matmul::dy_w(d_queries, weight, d_previous.reborrow(), Accum::Add);
+                matmul::dy_w(d_hidden, self.attention.key_value.weight(params), d_previous, Accum::Add);
+            }
+        }
+        scratch.give(d_out);
+
+        self.post_norm.backward_params(View::dense(attended, a), post_norm, grads);
+        let (u, d_queries_all) = (View::dense(u, h), View::dense(&d_queries, a));
+        self.attention.query.backward_params(u, d_queries_all, grads);
+        let values = View::dense(entities, 2 * a).columns(a..2 * a);
+        activation::relu_backward(values, ViewMut::dense(&mut d_entities, 2 * a).columns(a..2 * a));
+        for (x, d) in [(x, &d_entities), (u.rows(0..rows), &d_hidden)] {
+            let d = View::dense(d, 2 * a);
+            matmul::dyt_x(d, x, self.attention.key_value.weight_mut(grads), Accum::Add);
+            // The key's bias is no one's: see `Attention::project`.
+            let bias = &mut self.attention.key_value.bias_mut(grads)[a..];
+            linear::add_column_sums(d.columns(a..2 * a), bias);
+        }
+        let d_entities_view = View::dense(&d_entities, 2 * a);
+        matmul::dy_w(
+            d_entities_view,
+            self.attention.key_value.weight(params),
+            d_x.reborrow(),
+            Accum::Replace,
+        );
+        // An agent's own x asks, and is added to what it is answered.
+        let d_queries_own = View::dense(&d_queries[rows * a..], a);
+        let d_own_u = ViewMut::dense(&mut d_u[rows * h..], h);
+        matmul::dy_w(d_queries_own, self.attention.query.weight(params), d_own_u, Accum::Add);
+        add_to_agents(places.groups, View::dense(&d_u[rows * h..], h), d_x);
+        for buffer in [d_u, d_queries, d_attended, d_entities, d_hidden] {
+            scratch.give(buffer);
+        }
+    }
+
+    /// Entities' keys and values, agents' own rows and their queries.
+    fn project_entities(
+        &self,
+        params: &[f32],
+        places: Places<'_>,
+        x: View<'_>,
+        state: &mut HiddenTokenState,
+    ) {
+        let (h, a, rows) = (self.dim(), self.attention.dim, places.rows());
+        let u = state.u.fit(2 * rows * h);
+        for group in places.groups {
+            for (agent, entity) in group.queries.clone().zip(group.keys.clone()) {
+                u[(rows + agent) * h..][..h].copy_from_slice(x.row(entity));
+            }
+        }
+        let queries = ViewMut::dense(state.queries.fit(2 * rows * a), a).rows(rows..2 * rows);
+        self.attention.query.forward(params, View::dense(&u[rows * h..], h), queries);
+        self.keys_and_values(params, x, ViewMut::dense(state.entities.fit(x.rows * 2 * a), 2 * a));
+    }
+
+    /// Queries, keys and values of these rows' hidden tokens.
+    fn project_hidden(&self, params: &[f32], rows: Range<usize>, state: &mut HiddenTokenState) {
+        let (h, a) = (self.dim(), self.attention.dim);
+        let u = View::dense(&state.u, h).rows(rows.clone());
+        self.attention.query.forward(params, u, ViewMut::dense(&mut state.queries, a).rows(rows.clone()));
+        self.keys_and_values(params, u, ViewMut::dense(&mut state.hidden, 2 * a).rows(rows));
+    }
+
+    /// Keys without their bias, and ReLU'd values.
+    fn keys_and_values(&self, params: &[f32], x: View<'_>, mut to: ViewMut<'_>) {
+        let (a, layer) = (self.attention.dim, &self.attention.key_value);
+        matmul::x_wt(x, layer.weight(params), to.reborrow(), Accum::Replace);
+        linear::add_row_relu(to.columns(a..2 * a), &layer.bias(params)[a..]);
+    }
+
+    /// All behind the attention, of these of the 2R rows.
+    fn finish(&self, params: &[f32], rows: Range<usize>, state: &mut HiddenTokenState) {
+        let HiddenTokenState { u, attended, post_norm, out, .. } = state;
+        let (u, attended) = (View::dense(u, self.dim()), View::dense(attended, self.attention.dim));
+        self.post_norm.forward(params, rows, u, attended, post_norm, ViewMut::dense(out, self.dim()));
+    }
+
+    /// Softmax weights of these groups.
+    fn weights(&self, groups: &[Group]) -> usize {
+        let of_group = |group: &Group| group.queries.len() * (group.keys.len() + 1);
+        self.attention.heads * groups.iter().map(of_group).sum::<usize>()
+    }
+
+    fn head_dim(&self) -> usize {
+        self.attention.dim / self.attention.heads
+    }
+}
+
+impl HiddenTokenState {
+    /// Hidden tokens after each step, `[R, h]`.
+    pub fn history(&self) -> &[f32] {
+        &self.out[..self.out.len() / 2]
+    }
+
+    /// What became of the agents' own tokens, `[R, h]`.
+    pub fn own(&self) -> &[f32] {
+        &self.out[self.out.len() / 2..]
+    }
+}
+
+impl<'a> Places<'a> {
+    fn rows(&self) -> usize {
+        self.agent_times.last().copied().unwrap_or(0)
+    }
+
+    fn times(&self) -> usize {
+        self.agent_times.len().saturating_sub(1)
+    }
+
+    /// A time's groups and agent rows.
+    fn at(&self, time: usize) -> (&'a [Group], Range<usize>) {
+        let groups = &self.groups[self.group_times[time]..self.group_times[time + 1]];
+        (groups, self.agent_times[time]..self.agent_times[time + 1])
+    }
+
+    /// What is seen from so many query–key pairs on.
+    fn visible_from(&self, pairs: usize) -> Visible<'a> {
+        match self.visible {
+            Visible::All => Visible::All,
+            Visible::Where(flags) => Visible::Where(&flags[pairs..]),
+        }
+    }
+}
+
+/// Fills a time's rows of u with the hidden tokens of the time before.
+fn previous_tokens(
+    places: Places<'_>,
+    time: usize,
+    before: Option<View<'_>>,
+    state: &mut HiddenTokenState,
+    h: usize,
+) {
+    let (_, range) = places.at(time);
+    let to = &mut state.u[range.start * h..range.end * h];
+    if time > 0 {
+        to.copy_from_slice(&state.out[places.agent_times[time - 1] * h..][..range.len() * h]);
+    } else if let Some(before) = before {
+        for (row, to) in to.chunks_exact_mut(h).enumerate() {
+            to.copy_from_slice(before.row(row));
+        }
+    } else {
+        to.fill(0.0);
+    }
+}
+
+vectorized! {
+    /// Adds agents' rows to those of the entities they are.
+    fn add_to_agents<'a>(groups: &'a [Group], of_agents: View<'a>, d_x: ViewMut<'a>) {
+        for group in groups {
+            for (agent, entity) in group.queries.clone().zip(group.keys.clone()) {
+                math::add_scaled(d_x.row(entity), 1.0, of_agents.row(agent));
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;
