@@ -12,10 +12,9 @@
 //! cheap that acting, the greedy pass and training share one row of code, [`Decoder::decide`].
 
 use crate::Rows;
-use faer::Accum;
 use rit_nn::{
-    Attention, Buffer, LayoutBuilder, Linear, Scratch, View, ViewMut, activation, linear, math, matmul,
-    vectorized,
+    Accum, Attention, Buffer, LayoutBuilder, Linear, Scratch, View, ViewMut, activation, linear, math,
+    matmul, vectorized,
 };
 use std::ops::Range;
 

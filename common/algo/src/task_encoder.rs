@@ -6,9 +6,8 @@ use crate::{
     encoder::{Encoder, EncoderState},
     rit::{RitConfig, TaskRepresentations},
 };
-use faer::Accum;
 use rit_nn::{
-    Buffer, Gru, LayoutBuilder, Linear, Scratch, View, ViewMut, activation,
+    Accum, Buffer, Gru, LayoutBuilder, Linear, Scratch, View, ViewMut, activation,
     attention::{Group, Visible},
     gru::GruState,
     math, matmul, vectorized,
@@ -108,7 +107,9 @@ impl TaskEncoder {
         let history = View::dense(&state.gru.history, h);
         let to = Some(ViewMut::dense(&mut d_history, h));
         self.out.backward(params, history, d_representation, to, grads);
-        self.gru.backward(params, &rows.agent_times, &mut state.gru, &mut d_history, grads, scratch);
+        let GruState { gates, new_from_hidden, history } = &mut state.gru;
+        let left = (&mut gates[..], &new_from_hidden[..]);
+        self.gru.backward(params, &rows.agent_times, left, history, &mut d_history, grads, scratch);
         scratch.give(d_history);
         let d_gates = View::dense(&state.gru.gates, 3 * h);
 

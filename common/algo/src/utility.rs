@@ -6,8 +6,7 @@ use crate::{
     encoder::{Encoder, EncoderState},
     rit::RitConfig,
 };
-use faer::Accum;
-use rit_nn::{Gru, LayoutBuilder, Scratch, View, ViewMut, attention::Visible, gru::GruState, matmul};
+use rit_nn::{Accum, Gru, LayoutBuilder, Scratch, View, ViewMut, attention::Visible, gru::GruState, matmul};
 
 /// The utility function network.
 #[derive(Clone, Debug)]
@@ -90,7 +89,9 @@ impl Utility {
             grads,
             scratch,
         );
-        self.gru.backward(params, &rows.agent_times, &mut state.gru, &mut d_history, grads, scratch);
+        let GruState { gates, new_from_hidden, history } = &mut state.gru;
+        let left = (&mut gates[..], &new_from_hidden[..]);
+        self.gru.backward(params, &rows.agent_times, left, history, &mut d_history, grads, scratch);
         scratch.give(d_history);
         let d_gates = View::dense(&state.gru.gates, 3 * h);
         let encoded = View::dense(&state.encoder.encoded, width);

@@ -4,11 +4,10 @@
 //! sees nothing gets zeros, exactly, and passes no gradient.
 
 use crate::{
-    Buffer, LayoutBuilder, Linear, Scratch, View, ViewMut, activation, for_lanes, linear,
+    Accum, Buffer, LayoutBuilder, Linear, Scratch, View, ViewMut, activation, for_lanes, linear,
     math::{self, LANES, Lanes, each, load, store},
     matmul, vectorized,
 };
-use faer::Accum;
 use std::ops::Range;
 
 /// Query, key and value layers, h → a, with bias; the value goes through ReLU unless it is to stay linear; heads
@@ -91,15 +90,8 @@ impl Attention {
         let a = self.dim;
         let queries = ViewMut::dense(state.queries.fit(x_queries.rows * a), a);
         self.query.forward(params, x_queries, queries);
-        let mut key_values = ViewMut::dense(state.key_values.fit(x_keys.rows * 2 * a), 2 * a);
-        matmul::x_wt(x_keys, self.key_value.weight(params), key_values.reborrow(), Accum::Replace);
-        // The key's bias adds the same to all scores of a query, which softmax does not see: it is left out, and
-        // its gradient is zero.
-        let (values, bias) = (key_values.columns(a..2 * a), &self.key_value.bias(params)[a..]);
-        match self.values {
-            Values::Rectified => linear::add_row_relu(values, bias),
-            Values::Linear => linear::add_row(values, bias),
-        }
+        let key_values = ViewMut::dense(state.key_values.fit(x_keys.rows * 2 * a), 2 * a);
+        self.project_keys(params, x_keys, key_values);
     }
 
     /// Writes `out` (Q, a) from what [`Attention::project`] left.
@@ -123,12 +115,8 @@ impl Attention {
         out: ViewMut<'_>,
     ) {
         let AttentionState { queries, key_values, weights } = state;
-        let pairs: usize = groups.iter().map(Group::pairs).sum();
-        let weights = weights.fit(pairs * masks.len() * self.heads);
-        let queries = View::dense(queries, self.dim);
-        score(queries, key_values, groups, masks, weights, self.head_dim());
-        exponentiate(weights);
-        attend(key_values, groups, weights, out, self.head_dim());
+        let weights = weights.fit(weights_len(groups, masks.len(), self.heads));
+        self.attend_views(View::dense(queries, self.dim), key_values, groups, masks, weights, out);
     }
 
     /// Takes `d_out` (Q M, a). Writes `dx_queries` (Q, h) and `dx_keys` (K, h) and adds to the parameters'
@@ -152,11 +140,7 @@ impl Attention {
         // Every query and every key belongs to one group, so all of these are written.
         let (mut d_queries, mut d_key_values) = (scratch.take(queries.len()), scratch.take(key_values.len()));
         let d = (&mut d_queries[..], &mut d_key_values[..]);
-        attend_backward(d_out, View::dense(queries, a), key_values, groups, weights, d, self.head_dim());
-        if self.values == Values::Rectified {
-            let values = View::dense(key_values, 2 * a).columns(a..2 * a);
-            activation::relu_backward(values, ViewMut::dense(&mut d_key_values, 2 * a).columns(a..2 * a));
-        }
+        self.attend_views_backward(View::dense(queries, a), key_values, groups, weights, d_out, d);
         self.query.backward(params, x_queries, View::dense(&d_queries, a), Some(dx_queries), grads);
         let d_key_values_view = View::dense(&d_key_values, 2 * a);
         linear::add_column_sums(
@@ -169,10 +153,62 @@ impl Attention {
         scratch.give(d_queries);
     }
 
+    /// [`Attention::attend_masks`] of `queries` (Q, a) and `key_values` `[K, 2a]`, keys and values side by side;
+    /// leaves the softmax `weights` for backward.
+    pub(crate) fn attend_views(
+        &self,
+        queries: View<'_>,
+        key_values: &[f32],
+        groups: &[Group],
+        masks: &[Visible<'_>],
+        weights: &mut [f32],
+        out: ViewMut<'_>,
+    ) {
+        score(queries, key_values, groups, masks, weights, self.head_dim());
+        exponentiate(weights);
+        attend(key_values, groups, weights, out, self.head_dim());
+    }
+
+    /// From `d_out` (Q M, a) to the gradients by queries `[Q, a]` and by keys and values, before the values' ReLU,
+    /// `[K, 2a]`: `d`, all of both written.
+    pub(crate) fn attend_views_backward(
+        &self,
+        queries: View<'_>,
+        key_values: &[f32],
+        groups: &[Group],
+        weights: &[f32],
+        d_out: View<'_>,
+        d: (&mut [f32], &mut [f32]),
+    ) {
+        let (a, (d_queries, d_key_values)) = (self.dim, d);
+        let d = (d_queries, &mut d_key_values[..]);
+        attend_backward(d_out, queries, key_values, groups, weights, d, self.head_dim());
+        if self.values == Values::Rectified {
+            let values = View::dense(key_values, 2 * a).columns(a..2 * a);
+            activation::relu_backward(values, ViewMut::dense(d_key_values, 2 * a).columns(a..2 * a));
+        }
+    }
+
     /// Size of one head.
-    fn head_dim(&self) -> usize {
+    pub(crate) fn head_dim(&self) -> usize {
         self.dim / self.heads
     }
+
+    /// Keys (without their bias, which softmax does not see and whose gradient is zero) and values of `x` (K, h).
+    pub(crate) fn project_keys(&self, params: &[f32], x: View<'_>, mut key_values: ViewMut<'_>) {
+        let a = self.dim;
+        matmul::x_wt(x, self.key_value.weight(params), key_values.reborrow(), Accum::Replace);
+        let (values, bias) = (key_values.columns(a..2 * a), &self.key_value.bias(params)[a..]);
+        match self.values {
+            Values::Rectified => linear::add_row_relu(values, bias),
+            Values::Linear => linear::add_row(values, bias),
+        }
+    }
+}
+
+/// Softmax weights of these groups: `[heads, queries, masks, keys]` of one after another.
+pub fn weights_len(groups: &[Group], masks: usize, heads: usize) -> usize {
+    groups.iter().map(Group::pairs).sum::<usize>() * masks * heads
 }
 
 /// What a score is scaled with: 1/√(a / heads).

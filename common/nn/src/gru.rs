@@ -4,11 +4,10 @@
 //! time are a prefix of those before: sequences are ordered longest first.
 
 use crate::{
-    Buffer, LayoutBuilder, Linear, Scratch, View, ViewMut, for_lanes, linear,
+    Accum, Buffer, LayoutBuilder, Linear, Scratch, View, ViewMut, for_lanes, linear,
     math::{LANES, Lanes, each, load, sigmoid, store, tanh},
     matmul, vectorized,
 };
-use faer::Accum;
 
 /// The unit: gates in the order reset r, update u, new n;
 /// n = tanh(Wᵢₙ x + bᵢₙ + r ⊙ (Wₕₙ h + bₕₙ)), h' = (1 − u) ⊙ n + u ⊙ h.
@@ -28,7 +27,7 @@ pub struct GruState {
     /// In: the input's share of the gates, Wᵢ x without its bias. Out: r, u, n. `[R, 3h]`.
     pub gates: Buffer,
     /// Wₕₙ h + bₕₙ, `[R, h]`.
-    new_from_hidden: Buffer,
+    pub new_from_hidden: Buffer,
     /// The hidden state after each row, `[R, h]`.
     pub history: Buffer,
 }
@@ -92,16 +91,18 @@ impl Gru {
     }
 
     /// Takes `d_history` (R, h), the loss's gradient by each row's hidden state where it is used outside the
-    /// recurrence; overwrites it with the whole gradient, `state.gates` with the gradient by the input's share
+    /// recurrence; overwrites it with the whole gradient, `gates` with the gradient by the input's share
     /// of the gates, and adds to the gradients of the hidden weights and both biases. The weights of
-    /// [`Gru::input`] are the caller's.
+    /// [`Gru::input`] are the caller's. `history` (R, h) is what forward left.
     ///
     /// The state before the first time is taken as zeros.
+    #[allow(clippy::too_many_arguments, reason = "a matrix and its companions, each named")]
     pub fn backward(
         &self,
         params: &[f32],
         times: &[usize],
-        state: &mut GruState,
+        (gates, new_from_hidden): (&mut [f32], &[f32]),
+        history: &[f32],
         d_history: &mut [f32],
         grads: &mut [f32],
         scratch: &mut Scratch,
@@ -113,11 +114,11 @@ impl Gru {
             let before = if time == 0 { range.start } else { times[time - 1] };
             let (d_done, d_ahead) = d_history.split_at_mut(range.start * h);
             let d_previous = &mut d_done[before * h..];
-            let previous = if time == 0 { &[] } else { &state.history[before * h..][..range.len() * h] };
+            let previous = if time == 0 { &[] } else { &history[before * h..][..range.len() * h] };
             let d_from_hidden = &mut d_from_hidden[..range.len() * 3 * h];
             step_backward(
-                &mut state.gates[range.start * 3 * h..range.end * 3 * h],
-                &state.new_from_hidden[range.start * h..range.end * h],
+                &mut gates[range.start * 3 * h..range.end * 3 * h],
+                &new_from_hidden[range.start * h..range.end * h],
                 previous,
                 &d_ahead[..range.len() * h],
                 d_from_hidden,
@@ -138,7 +139,7 @@ impl Gru {
             }
         }
         scratch.give(d_from_hidden);
-        linear::add_column_sums(View::dense(&state.gates, 3 * h), self.input.bias_mut(grads));
+        linear::add_column_sums(View::dense(gates, 3 * h), self.input.bias_mut(grads));
     }
 }
 
@@ -317,7 +318,9 @@ mod tests {
         };
         let mut state = run(&gru, &params, &x, &TIMES, None);
         let (mut grads, mut dx, mut d_history) = (vec![0.0; len], vec![0.0; x.len()], to.clone());
-        gru.backward(&params, &TIMES, &mut state, &mut d_history, &mut grads, &mut Scratch::default());
+        let GruState { gates, new_from_hidden, history } = &mut state;
+        let (left, scratch) = ((&mut gates[..], &new_from_hidden[..]), &mut Scratch::default());
+        gru.backward(&params, &TIMES, left, history, &mut d_history, &mut grads, scratch);
         let d_gates = View::dense(&state.gates, 3 * H);
         matmul::dyt_x(d_gates, View::dense(&x, INPUTS), gru.input.weight_mut(&mut grads), Accum::Add);
         matmul::dy_w(d_gates, gru.input.weight(&params), ViewMut::dense(&mut dx, INPUTS), Accum::Replace);

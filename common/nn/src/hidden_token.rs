@@ -9,6 +9,7 @@
 
 mod attend;
 
+use crate::Accum;
 use crate::{
     Attention, Buffer, LayoutBuilder, Scratch, View, ViewMut, activation,
     attention::{Group, Visible},
@@ -17,7 +18,6 @@ use crate::{
     vectorized,
 };
 use attend::{Tokens, attend, attend_backward};
-use faer::Accum;
 use std::ops::Range;
 
 /// The block: attention with its output layer, feed-forward, norms behind the sums.

@@ -4,6 +4,7 @@
 //!   shapes once, and layers hold ranges into the buffer.
 //! - Each layer's forward stands directly above its backward. Backward *adds* to the gradients it is given
 //!   for parameters, and writes or adds to input gradients as its documentation says.
+//! - A network is written as its forward pass on a [`tape`], whose operations are these layers.
 //! - Matrices are row-major [`View`]s; [`matmul`] is the one place that speaks to faer.
 //! - Everything runs on the calling thread. Whoever wants threads splits the batch.
 
@@ -21,6 +22,7 @@ pub mod matmul;
 pub mod optimizer;
 pub mod post_norm;
 mod scratch;
+pub mod tape;
 mod view;
 
 pub use attention::Attention;
@@ -29,7 +31,9 @@ pub use hidden_token::HiddenToken;
 pub use layer_norm::LayerNorm;
 pub use layout::{Initial, Layout, LayoutBuilder, Param};
 pub use linear::Linear;
+pub use matmul::Accum;
 pub use optimizer::{Optimizer, OptimizerKind};
 pub use post_norm::PostNorm;
 pub use scratch::{Buffer, Scratch};
+pub use tape::{Stock, Tape, Var};
 pub use view::{View, ViewMut};

@@ -1,7 +1,6 @@
 //! A linear layer, y = x Wᵀ + b.
 
-use crate::{LayoutBuilder, View, ViewMut, math, matmul, vectorized};
-use faer::Accum;
+use crate::{Accum, LayoutBuilder, View, ViewMut, math, matmul, vectorized};
 use std::ops::Range;
 
 /// A linear layer, or several over the same input that lie side by side and are computed as one.
@@ -105,6 +104,24 @@ vectorized! {
             for (y, x) in y.row(at).iter_mut().zip(row) {
                 *y += x;
             }
+        }
+    }
+}
+
+vectorized! {
+    /// y = x.
+    pub fn copy<'a>(y: ViewMut<'a>, x: View<'a>) {
+        for row in 0..y.rows {
+            y.row(row).copy_from_slice(x.row(row));
+        }
+    }
+}
+
+vectorized! {
+    /// y = 0.
+    pub fn zero<'a>(y: ViewMut<'a>) {
+        for row in 0..y.rows {
+            y.row(row).fill(0.0);
         }
     }
 }

@@ -6,8 +6,26 @@
 //! gives this for two rows and more; see [`x_wt`] for one row, and the test below.
 
 use crate::{View, ViewMut};
-use faer::{Accum, Par, linalg::matmul::matmul, mat};
+use faer::{Par, linalg::matmul::matmul, mat};
 use std::sync::atomic::{AtomicU64, Ordering};
+
+/// What a product does with what stands at its destination.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Accum {
+    /// Writes over it, whatever it holds.
+    Replace,
+    /// Adds to it.
+    Add,
+}
+
+impl From<Accum> for faer::Accum {
+    fn from(accum: Accum) -> Self {
+        match accum {
+            Accum::Replace => Self::Replace,
+            Accum::Add => Self::Add,
+        }
+    }
+}
 
 /// Multiplications and additions of all products so far, in this process.
 static FLOPS: AtomicU64 = AtomicU64::new(0);
@@ -29,14 +47,14 @@ pub fn x_wt(x: View<'_>, w: View<'_>, y: ViewMut<'_>, accum: Accum) {
         return single_row(x, w, y, accum);
     }
     count(x.rows, x.cols, w.rows);
-    matmul(write(y), accum, read(x), read(w).transpose(), 1.0_f32, Par::Seq);
+    matmul(write(y), accum.into(), read(x), read(w).transpose(), 1.0_f32, Par::Seq);
 }
 
 /// `dx = dy w`, or `dx += dy w`: a layer's backward to its input. `dy` (rows, out), `dx` (rows, in).
 pub fn dy_w(dy: View<'_>, w: View<'_>, dx: ViewMut<'_>, accum: Accum) {
     debug_assert_eq!((dy.cols, dy.rows, dx.cols), (w.rows, dx.rows, w.cols));
     count(dy.rows, dy.cols, w.cols);
-    matmul(write(dx), accum, read(dy), read(w), 1.0_f32, Par::Seq);
+    matmul(write(dx), accum.into(), read(dy), read(w), 1.0_f32, Par::Seq);
 }
 
 /// `dw = dyᵀ x`, or `dw += dyᵀ x`: a layer's backward to its weight. `dy` (rows, out), `x` (rows, in), `dw`
@@ -44,7 +62,7 @@ pub fn dy_w(dy: View<'_>, w: View<'_>, dx: ViewMut<'_>, accum: Accum) {
 pub fn dyt_x(dy: View<'_>, x: View<'_>, dw: ViewMut<'_>, accum: Accum) {
     debug_assert_eq!((dy.rows, dy.cols, x.cols), (x.rows, dw.rows, dw.cols));
     count(dy.cols, dy.rows, x.cols);
-    matmul(write(dw), accum, read(dy).transpose(), read(x), 1.0_f32, Par::Seq);
+    matmul(write(dw), accum.into(), read(dy).transpose(), read(x), 1.0_f32, Par::Seq);
 }
 
 /// One row goes through faer's matrix–vector path, which sums in another order. A second row of zeros keeps

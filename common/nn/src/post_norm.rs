@@ -1,9 +1,9 @@
 //! What follows the attention in a transformer's block whose norms stand behind their sums ("post-norm").
 
+use crate::Accum;
 use crate::{
     Buffer, LayerNorm, LayoutBuilder, Linear, View, ViewMut, activation, linear, matmul, vectorized,
 };
-use faer::Accum;
 use std::ops::Range;
 
 /// With u the row that asked and a what its attention gave:

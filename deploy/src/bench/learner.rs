@@ -2,12 +2,11 @@
 
 use super::{Model, Report, cpu_s, random_episodes, thread_cpu_s};
 use crate::failure::Failure;
-use faer::Accum;
 use rit_algo::Update;
 use rit_env::{Split, Task};
 use rit_episode::Stream;
 use rit_learner::replay::Replay;
-use rit_nn::{View, ViewMut, matmul};
+use rit_nn::{Accum, View, ViewMut, matmul};
 use std::{
     fs,
     sync::Arc,
