@@ -4,7 +4,7 @@ use crate::{
     sink::{EpisodeSink, SinkError},
     weights::Weights,
 };
-use rit_algo::{Acting, Rit};
+use rit_algo::{Acting, Model};
 use rit_config::Config;
 use rit_env::{
     Split,
@@ -44,7 +44,7 @@ pub enum RolloutError {
 
 /// What the rollout thread works with.
 pub(crate) struct Roller {
-    pub(crate) rit: Arc<Rit>,
+    pub(crate) model: Arc<Model>,
     pub(crate) rollout: Rollout,
     pub(crate) sink: EpisodeSink,
     pub(crate) layout: PayloadLayout,
@@ -88,7 +88,7 @@ impl Roller {
                 }
                 None => {
                     let params = self.params(runtime, version)?;
-                    &mut acting.insert((version, Acting::new(Arc::clone(&self.rit), &params))).1
+                    &mut acting.insert((version, Acting::new(&self.model, &params))).1
                 }
             };
             let jobs: Vec<Job> = lease
@@ -111,7 +111,7 @@ impl Roller {
     fn params(&mut self, runtime: &Handle, version: u64) -> Result<Vec<f32>, RolloutError> {
         let Snapshot { params, .. } = &*runtime.block_on(self.weights.get(version))?;
         let (words, rest) = params.as_chunks::<4>();
-        let expected = self.rit.acting().len();
+        let expected = self.model.acting().len();
         if words.len() != expected || !rest.is_empty() {
             return Err(RolloutError::OtherModel { found: words.len(), expected });
         }

@@ -5,7 +5,7 @@ use crate::{
     sink::{EpisodeSink, FrameStream},
     weights::Weights,
 };
-use rit_algo::{ConfigError, Rit};
+use rit_algo::{ConfigError, Model};
 use rit_config::{Config, RunDir, resolve};
 use rit_episode::wire::{self, PayloadLayout};
 use rit_ipc::{EpisodeSender, OpenError, RunSpace, RunSpaceError};
@@ -246,7 +246,7 @@ impl Actor {
         let (done, lease_done) = mpsc::channel(1);
         let stop = Arc::new(AtomicBool::new(false));
         let roller = Roller {
-            rit: Arc::new(Rit::new(config.rit())?),
+            model: Arc::new(Model::new(config.model())?),
             rollout: Roller::rollout(&config),
             sink: match &self.learner {
                 Learner::Here(run_dir) => {

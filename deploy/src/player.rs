@@ -1,7 +1,7 @@
 //! Who plays an evaluation or a picture, and what: `--policy`, `--run` and `--experiment`.
 
 use crate::{cli::PlayOptions, experiments, failure::Failure};
-use rit_algo::{Acting, Rit};
+use rit_algo::{Acting, Model};
 use rit_config::{Config, RunDir};
 use rit_env::particle::Script;
 use rit_episode::{Policy, RunSeed};
@@ -34,7 +34,7 @@ pub struct Trained {
     /// The run's configuration.
     pub config: Config,
     /// Its model.
-    pub rit: Arc<Rit>,
+    pub model: Arc<Model>,
     /// All parameters of its newest checkpoint.
     pub params: Vec<f32>,
 }
@@ -53,9 +53,9 @@ impl Trained {
                 "{root} has no checkpoint yet; `rit ctl --run {root} checkpoint` writes one"
             )));
         }
-        let rit = Arc::new(Rit::new(config.rit()).map_err(Failure::input)?);
-        let params = weights_file::load(&path, &rit)?;
-        Ok(Self { config, rit, params })
+        let model = Arc::new(Model::new(config.model()).map_err(Failure::input)?);
+        let params = weights_file::load(&path, model.layout())?;
+        Ok(Self { config, model, params })
     }
 }
 
@@ -112,8 +112,8 @@ impl Player {
                 "give --run DIR, whose checkpoint plays, or a --policy {SCRIPT}NAME that needs none"
             )));
         };
-        let Trained { config, rit, params } = Trained::load(run)?;
-        let policy = Box::new(Acting::new(Arc::clone(&rit), &params[rit.acting()]));
+        let Trained { config, model, params } = Trained::load(run)?;
+        let policy = Box::new(Acting::new(&model, &params[model.acting()]));
         let weights_digest = Some(weights_file::digest(&params));
         Ok(Self { name: CHECKPOINT.to_owned(), config, policy, weights_digest })
     }

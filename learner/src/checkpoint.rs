@@ -5,7 +5,7 @@
 //! | file | what it holds |
 //! |---|---|
 //! | `weights.safetensors` | the weights, under the specification's names |
-//! | `state.safetensors` | target network, optimiser moments, the acting weights that open batches are rolled with |
+//! | `state.safetensors` | the learner's state under its names (target network, optimiser moments, …), and the acting weights that open batches are rolled with |
 //! | `checkpoint.json` | progress, the terms of open batches, positions in other files |
 //! | `SHA256SUMS` | of the files above; `sha256sum --check SHA256SUMS` |
 //!
@@ -22,8 +22,11 @@ use crate::{
     weights::Snapshot,
     weights_file::{self, WeightsFileError},
 };
-use rit_algo::Rit;
-use rit_config::{Algorithm, OptimizerName, RunDir};
+use rit_algo::{
+    Learner, Model,
+    learner::{NamedState, Numbers},
+};
+use rit_config::{Algorithm, RunDir};
 use rit_episode::{Episode, wire::Expected};
 use safetensors::{Dtype, SafeTensorError, SafeTensors, tensor::TensorView};
 use sha2::{Digest as _, Sha256};
@@ -47,14 +50,10 @@ const PARTIAL: &str = "partial";
 /// All that training needs to go on, but for replay.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TrainingState {
-    /// θ, ω, σ, φ.
+    /// All parameters.
     pub params: Vec<f32>,
-    /// The target network's θ, ω, σ.
-    pub target: Vec<f32>,
-    /// The optimiser's mean of gradients; empty for RMSprop.
-    pub mean: Vec<f32>,
-    /// The optimiser's mean of squared gradients.
-    pub mean_square: Vec<f32>,
+    /// The rest of the learner: see [`Learner::state`].
+    pub learner: Vec<NamedState<'static>>,
     /// The acting weights that the terms name.
     pub snapshots: Vec<Snapshot>,
     /// The rest.
@@ -117,7 +116,7 @@ pub enum CheckpointError {
 /// When the disk refuses; the checkpoints before are left as they were.
 pub fn save(
     run_dir: &RunDir,
-    rit: &Rit,
+    model: &Model,
     state: &TrainingState,
     keep: usize,
 ) -> Result<PathBuf, CheckpointError> {
@@ -128,7 +127,7 @@ pub fn save(
         fs::remove_dir_all(&partial).map_err(io(&partial))?;
     }
     fs::create_dir(&partial).map_err(io(&partial))?;
-    let written = write_folder(&partial, rit, state);
+    let written = write_folder(&partial, model, state);
     if written.is_err() {
         // What could not be written whole takes no space. If that fails too, the next attempt removes it.
         let _ = fs::remove_dir_all(&partial);
@@ -155,7 +154,7 @@ pub fn save(
     Ok(Path::new("checkpoints").join(name))
 }
 
-fn write_folder(folder: &Path, rit: &Rit, state: &TrainingState) -> Result<(), CheckpointError> {
+fn write_folder(folder: &Path, model: &Model, state: &TrainingState) -> Result<(), CheckpointError> {
     let format = |name: &str| {
         let path = folder.join(name);
         move |error| CheckpointError::Format { path, error }
@@ -163,7 +162,7 @@ fn write_folder(folder: &Path, rit: &Rit, state: &TrainingState) -> Result<(), C
     let manifest = serde_json::to_vec_pretty(&state.manifest);
     let manifest = manifest.map_err(|error| io(&folder.join(MANIFEST))(error.into()))?;
     let files = [
-        (WEIGHTS, weights_file::encode(rit, &state.params).map_err(format(WEIGHTS))?),
+        (WEIGHTS, weights_file::encode(model.layout(), &state.params).map_err(format(WEIGHTS))?),
         (STATE, encode_state(state).map_err(format(STATE))?),
         (MANIFEST, manifest),
     ];
@@ -206,21 +205,21 @@ pub struct Loaded {
     pub damaged: Vec<CheckpointError>,
 }
 
-/// The newest checkpoint that is whole and of a run of this algorithm, with replay's last `buffer_size` episodes;
+/// The newest checkpoint that is whole and of a run that this learner can go on from, with replay's last `buffer_size` episodes;
 /// `None` where none was ever written.
 ///
 /// # Errors
 /// When there are checkpoints and none can be used.
 pub fn load_newest(
     run_dir: &RunDir,
-    rit: &Rit,
+    learner: &dyn Learner,
     expected: &Expected,
     algorithm: &Algorithm,
 ) -> Result<Option<Loaded>, CheckpointError> {
     let all = run_dir.checkpoints();
     let mut damaged = Vec::new();
     for folder in folders(&all)?.into_iter().rev() {
-        let loaded = load(&folder, rit, expected.tasks.len(), algorithm).and_then(|state| {
+        let loaded = load(&folder, learner, expected.tasks.len(), algorithm).and_then(|state| {
             let end = state.manifest.progress.episodes;
             let numbers = end.saturating_sub(algorithm.buffer_size as u64)..end;
             let replay = replay_log::read(&run_dir.replay(), expected, numbers)?;
@@ -240,7 +239,7 @@ pub fn load_newest(
 /// Reads one checkpoint's folder.
 fn load(
     folder: &Path,
-    rit: &Rit,
+    learner: &dyn Learner,
     tasks: usize,
     algorithm: &Algorithm,
 ) -> Result<TrainingState, CheckpointError> {
@@ -261,57 +260,68 @@ fn load(
         .map_err(|error| inconsistent(MANIFEST, error.to_string()))?;
     manifest.check(tasks, algorithm).map_err(|what| inconsistent(MANIFEST, what))?;
     checked(WEIGHTS)?;
-    let params = weights_file::load(&folder.join(WEIGHTS), rit)?;
+    let params = weights_file::load(&folder.join(WEIGHTS), learner.model().layout())?;
     let bytes = checked(STATE)?;
     let format = |error| CheckpointError::Format { path: folder.join(STATE), error };
     let tensors = SafeTensors::deserialize(&bytes).map_err(format)?;
-    let tensor = |name: &str, len: usize| {
+    let tensor = |name: &str, kind: Dtype, len: usize| {
         let tensor = tensors.tensor(name).map_err(format)?;
-        let (words, _) = tensor.data().as_chunks::<4>();
-        if tensor.dtype() != Dtype::F32 || words.len() != len {
-            return Err(inconsistent(STATE, format!("{name} has {} numbers, not {len}", words.len())));
+        if (tensor.dtype(), tensor.shape()) == (kind, &[len]) {
+            return Ok(tensor.data().to_vec());
         }
-        Ok(words.iter().map(|&word| f32::from_le_bytes(word)).collect::<Vec<f32>>())
+        let (found, shape) = (tensor.dtype(), tensor.shape());
+        Err(inconsistent(STATE, format!("{name} is {shape:?} {found:?}, not [{len}] {kind:?}")))
     };
+    let mut state = Vec::new();
+    for NamedState { name, numbers } in learner.state() {
+        let bytes = tensor(name, dtype(&numbers), numbers.len())?;
+        let numbers = match numbers {
+            Numbers::F32(_) => Numbers::F32(numbers_of(&bytes, f32::from_le_bytes).into()),
+            Numbers::F64(_) => Numbers::F64(numbers_of(&bytes, f64::from_le_bytes).into()),
+            Numbers::U64(_) => Numbers::U64(numbers_of(&bytes, u64::from_le_bytes).into()),
+        };
+        state.push(NamedState { name, numbers });
+    }
     let mut snapshots = Vec::new();
     for SnapshotMark { version, env_steps } in &manifest.snapshots {
-        let params = tensor(&snapshot_name(*version), rit.acting().len())?;
-        snapshots.push(Snapshot::new(*version, *env_steps, &params));
+        let params = tensor(&snapshot_name(*version), Dtype::F32, learner.model().acting().len())?;
+        snapshots.push(Snapshot { version: *version, env_steps: *env_steps, params: params.into() });
     }
-    let mean_len = match algorithm.optimizer {
-        OptimizerName::Adam => params.len(),
-        OptimizerName::RmsProp => 0,
-    };
-    Ok(TrainingState {
-        target: tensor(TARGET, rit.target().len())?,
-        mean: tensor(MEAN, mean_len)?,
-        mean_square: tensor(MEAN_SQUARE, params.len())?,
-        snapshots,
-        params,
-        manifest,
-    })
+    Ok(TrainingState { params, learner: state, snapshots, manifest })
 }
 
-const TARGET: &str = "target";
-const MEAN: &str = "optimizer.mean";
-const MEAN_SQUARE: &str = "optimizer.mean_square";
+/// Little-endian numbers.
+fn numbers_of<T, const SIZE: usize>(bytes: &[u8], from: fn([u8; SIZE]) -> T) -> Vec<T> {
+    bytes.as_chunks().0.iter().map(|&bytes| from(bytes)).collect()
+}
+
+fn dtype(numbers: &Numbers<'_>) -> Dtype {
+    match numbers {
+        Numbers::F32(_) => Dtype::F32,
+        Numbers::F64(_) => Dtype::F64,
+        Numbers::U64(_) => Dtype::U64,
+    }
+}
 
 fn snapshot_name(version: u64) -> String {
     format!("acting.{version}")
 }
 
 fn encode_state(state: &TrainingState) -> Result<Vec<u8>, SafeTensorError> {
-    let bytes = |numbers: &[f32]| numbers.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>();
-    let mut tensors = vec![
-        (TARGET.to_owned(), bytes(&state.target)),
-        (MEAN.to_owned(), bytes(&state.mean)),
-        (MEAN_SQUARE.to_owned(), bytes(&state.mean_square)),
-    ];
-    for snapshot in &state.snapshots {
-        tensors.push((snapshot_name(snapshot.version), snapshot.params.to_vec()));
+    let mut tensors = Vec::new();
+    for NamedState { name, numbers } in &state.learner {
+        let bytes: Vec<u8> = match numbers {
+            Numbers::F32(numbers) => numbers.iter().flat_map(|x| x.to_le_bytes()).collect(),
+            Numbers::F64(numbers) => numbers.iter().flat_map(|x| x.to_le_bytes()).collect(),
+            Numbers::U64(numbers) => numbers.iter().flat_map(|x| x.to_le_bytes()).collect(),
+        };
+        tensors.push(((*name).to_owned(), dtype(numbers), numbers.len(), bytes));
     }
-    let views = tensors.iter().map(|(name, bytes)| {
-        TensorView::new(Dtype::F32, vec![bytes.len() / 4], bytes).map(|view| (name.as_str(), view))
+    for Snapshot { version, params, .. } in &state.snapshots {
+        tensors.push((snapshot_name(*version), Dtype::F32, params.len() / 4, params.to_vec()));
+    }
+    let views = tensors.iter().map(|(name, kind, len, bytes)| {
+        TensorView::new(*kind, vec![*len], bytes).map(|view| (name.as_str(), view))
     });
     safetensors::serialize(views.collect::<Result<Vec<_>, _>>()?, None)
 }

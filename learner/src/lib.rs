@@ -1,7 +1,7 @@
 //! The learner: receives episodes, updates the weights, and serves whoever asks.
 //!
 //! Four threads and a runtime. [`receive`] reads shared memory; [`trainer`] owns replay and weights; [`writer`]
-//! writes replay and checkpoints; [`update`](rit_algo::Update)'s threads work on batches. On the runtime,
+//! writes replay and checkpoints; a [`Learner`](rit_algo::Learner)'s own threads work on batches. On the runtime,
 //! [`coordinator`] owns the [`ledger`]; the gRPC services and the [`web`] page turn calls into its events, by a
 //! [`run_handle`].
 
@@ -13,6 +13,7 @@ pub mod episodes_service;
 pub mod evaluation;
 pub mod gauges;
 pub mod ledger;
+pub mod measured;
 pub mod metrics;
 pub mod prometheus;
 pub mod receive;

@@ -5,8 +5,8 @@ use crate::{
     append_file::AppendFile,
     checkpoint::Progress,
     evaluation::{Exploring, TaskResult},
+    measured::Measured,
 };
-use rit_algo::Losses;
 use rit_episode::Episode;
 use rit_proto::v1;
 use serde::{Deserialize, Serialize};
@@ -108,11 +108,11 @@ pub enum Line {
         wall_s: f64,
         /// ε of the episodes handed out now.
         epsilon: f64,
-        /// Losses of the last update.
-        #[serde(flatten)]
-        losses: LossLine,
         /// Exploring episodes of late.
         tasks: BTreeMap<String, TaskResult>,
+        /// What the last update reported. The last field: it takes the keys that no other has.
+        #[serde(flatten)]
+        measured: Measured,
     },
     /// A greedy evaluation.
     Evaluation {
@@ -143,13 +143,13 @@ impl Line {
             ..result.to_message()
         };
         let training = match self {
-            Self::Training { epsilon, losses, .. } => Some(v1::Training {
+            Self::Training { epsilon, measured, .. } => Some(v1::Training {
                 epsilon: *epsilon,
-                td_loss: losses.td_loss,
-                contrastive_loss: losses.contrastive_loss,
-                grad_norm: losses.grad_norm,
-                q_total_mean: losses.q_total_mean,
-                target_mean: losses.target_mean,
+                td_loss: measured.get("td_loss").unwrap_or_default(),
+                contrastive_loss: measured.get("contrastive_loss").unwrap_or_default(),
+                grad_norm: measured.get("grad_norm").unwrap_or_default(),
+                q_total_mean: measured.get("q_total_mean").unwrap_or_default(),
+                target_mean: measured.get("target_mean").unwrap_or_default(),
             }),
             Self::Evaluation { .. } => None,
         };
@@ -161,24 +161,6 @@ impl Line {
             tasks: tasks.iter().map(named).collect(),
             training,
         }
-    }
-}
-
-/// Losses as they stand in a line.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[allow(missing_docs, reason = "as in Losses")]
-pub struct LossLine {
-    pub td_loss: f64,
-    pub contrastive_loss: f64,
-    pub grad_norm: f64,
-    pub q_total_mean: f64,
-    pub target_mean: f64,
-}
-
-impl From<Losses> for LossLine {
-    fn from(losses: Losses) -> Self {
-        let Losses { td_loss, contrastive_loss, grad_norm, q_total_mean, target_mean } = losses;
-        Self { td_loss, contrastive_loss, grad_norm, q_total_mean, target_mean }
     }
 }
 
@@ -306,7 +288,7 @@ mod tests {
             progress: Progress { env_steps, episodes: 3, updates: 2 },
             wall_s: 0.5,
             epsilon: 0.1 + 0.2,
-            losses: Losses { td_loss: 1e-9, target_mean: -3.0, ..Losses::default() }.into(),
+            measured: Measured(vec![("td_loss".into(), 1e-9), ("target_mean".into(), -3.0)]),
             tasks: BTreeMap::from([("game-1".to_owned(), result)]),
         }
     }

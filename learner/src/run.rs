@@ -14,10 +14,13 @@ use crate::{
     weights::WeightsService,
     writer::Writer,
 };
-use rit_algo::{ConfigError, Rit};
+use rit_algo::{ConfigError, Learner, Model};
 use rit_config::{Algorithm, Config, RunDir, Tls};
 use rit_env::Split;
-use rit_episode::wire::{Expected, PayloadLayout};
+use rit_episode::{
+    Stream,
+    wire::{Expected, PayloadLayout},
+};
 use rit_ipc::{CreateError, EpisodeReceiver, Limits, ReceiveError, RunSpace, RunSpaceError};
 use rit_proto::{
     MESSAGE_BYTES_MAX,
@@ -118,7 +121,11 @@ pub async fn run(
 ) -> Result<Summary, LearnerError> {
     let doors = listen(&run_dir, &config).await?;
     let web = Web::bind(&run_dir, config.web.listen).await?;
-    let rit = Arc::new(Rit::new(config.rit())?);
+    let model = Arc::new(Model::new(config.model())?);
+    let params = model.initial(&mut config.seed.stream(Stream::Weights, 0));
+    let learner = rit_algo::learner(Arc::clone(&model), config.update(), params).map_err(|error| {
+        LearnerError::Io { what: "the update's threads".into(), error: io::Error::other(error) }
+    })?;
     let expected = expected(&run_dir, &config);
     let space = RunSpace::new(&run_dir.shared_memory_root())?;
     let limits = Limits::new(expected.layout.len(), config.actors.count.max(config.actors.count_max));
@@ -131,19 +138,18 @@ pub async fn run(
     let news = Box::new(move |what| {
         let _ = news.blocking_send(Event::News(what));
     });
-    let loaded = load(&run_dir, &rit, &expected, &config.algorithm)?;
+    let loaded = load(&run_dir, &*learner, &expected, &config.algorithm)?;
     let episodes = loaded.as_ref().map_or(0, |loaded| loaded.state.manifest.progress.episodes);
     let writer = Writer {
         run_dir: run_dir.clone(),
-        rit: Arc::clone(&rit),
+        model: Arc::clone(&model),
         log: ReplayLog::open(&run_dir.replay(), expected.layout, run_dir.run_id(), episodes)?,
         buffer_size: config.algorithm.buffer_size,
         keep: config.checkpoints.keep,
         events: events.clone(),
     };
     let (to_write, write_queue) = mpsc::channel();
-    let (trainer, board) =
-        Trainer::new(config.clone(), run_dir.clone(), Arc::clone(&rit), loaded, news, to_write)?;
+    let (trainer, board) = Trainer::new(config.clone(), run_dir.clone(), learner, loaded, news, to_write)?;
     let metrics = trainer.metrics_follower();
     let welcome = Welcome { actor: 0, run_id: run_dir.run_id().to_vec(), config: config.to_toml()? };
     let coordinator = Coordinator::new(config.clone(), welcome, trainer.beginning(), work, fences);
@@ -169,7 +175,7 @@ pub async fn run(
         })?
     };
 
-    let handle = RunHandle::new(events.clone(), board.clone(), config, run_dir.clone(), rit, set_log);
+    let handle = RunHandle::new(events.clone(), board.clone(), config, run_dir.clone(), model, set_log);
     let mut serving_web = JoinSet::new();
     if let Some(web) = web {
         tracing::info!(address = %web.address(), "the web page is served");
@@ -253,11 +259,11 @@ pub fn expected(run_dir: &RunDir, config: &Config) -> Expected {
 /// The newest checkpoint that can be used, if any was ever written.
 fn load(
     run_dir: &RunDir,
-    rit: &Rit,
+    learner: &dyn Learner,
     expected: &Expected,
     algorithm: &Algorithm,
 ) -> Result<Option<Loaded>, LearnerError> {
-    let loaded = checkpoint::load_newest(run_dir, rit, expected, algorithm)?;
+    let loaded = checkpoint::load_newest(run_dir, learner, expected, algorithm)?;
     if let Some(Loaded { folder, state, damaged, .. }) = &loaded {
         for error in damaged {
             tracing::error!(%error, "a checkpoint is damaged; the one before is used");

@@ -6,7 +6,7 @@ use crate::{
     trainer::{Checkpointed, evaluation_seed},
     weights::{Snapshot, WeightsBoard},
 };
-use rit_algo::{Acting, Rit};
+use rit_algo::{Acting, Model};
 use rit_config::{Config, ConfigError, RunDir, RunDirError, set, set_live};
 use rit_env::{Scene, TaskSet, UnknownName};
 use rit_episode::{Episode, RunSeed};
@@ -76,7 +76,7 @@ pub struct RunHandle {
     setting: Arc<Mutex<()>>,
     run_dir: RunDir,
     set_log: SetLog,
-    rit: Arc<Rit>,
+    model: Arc<Model>,
     /// One caller's episodes at a time: training goes on beside them.
     rollouts: Arc<Semaphore>,
 }
@@ -88,12 +88,21 @@ impl RunHandle {
         board: Arc<WeightsBoard>,
         config: Config,
         run_dir: RunDir,
-        rit: Arc<Rit>,
+        model: Arc<Model>,
         set_log: SetLog,
     ) -> Self {
         let config = watch::Sender::new(Arc::new(config));
         let setting = Arc::default();
-        Self { events, board, config, setting, run_dir, set_log, rit, rollouts: Arc::new(Semaphore::new(1)) }
+        Self {
+            events,
+            board,
+            config,
+            setting,
+            run_dir,
+            set_log,
+            model,
+            rollouts: Arc::new(Semaphore::new(1)),
+        }
     }
 
     /// The run's configuration as it is now.
@@ -203,10 +212,10 @@ impl RunHandle {
         work: impl FnOnce(&mut Acting, &Arc<Snapshot>) -> T + Send + 'static,
     ) -> Result<T, AskError> {
         let turn = Arc::clone(&self.rollouts).acquire_owned().await.map_err(|_| AskError::Over)?;
-        let (snapshot, rit) = (self.board.newest(), Arc::clone(&self.rit));
+        let (snapshot, model) = (self.board.newest(), Arc::clone(&self.model));
         let rolled = tokio::task::spawn_blocking(move || {
             let _turn = turn;
-            work(&mut Acting::new(rit, &snapshot.to_params()), &snapshot)
+            work(&mut Acting::new(&model, &snapshot.to_params()), &snapshot)
         });
         Ok(rolled.await?)
     }

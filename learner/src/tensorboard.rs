@@ -117,18 +117,16 @@ fn summary(line: &Line) -> Summary {
     let mut value = Vec::new();
     let mut scalar = |tag: String, number: f64| value.push(Value { tag, simple_value: Some(number as f32) });
     let (group, tasks): (&str, &BTreeMap<String, TaskResult>) = match line {
-        Line::Training { epsilon, losses, tasks, progress, .. } => {
-            for (tag, number) in [
-                ("td_loss", losses.td_loss),
-                ("contrastive_loss", losses.contrastive_loss),
-                ("grad_norm", losses.grad_norm),
-                ("q_total_mean", losses.q_total_mean),
-                ("target_mean", losses.target_mean),
+        Line::Training { epsilon, measured, tasks, progress, .. } => {
+            for (name, number) in &measured.0 {
+                scalar(format!("training/{name}"), *number);
+            }
+            for (name, number) in [
                 ("epsilon", *epsilon),
                 ("episodes", progress.episodes as f64),
                 ("updates", progress.updates as f64),
             ] {
-                scalar(format!("training/{tag}"), number);
+                scalar(format!("training/{name}"), number);
             }
             ("exploring", tasks)
         }
@@ -199,7 +197,7 @@ enum SessionStatus {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{checkpoint::Progress, evaluation::Exploring, metrics::LossLine};
+    use crate::{checkpoint::Progress, evaluation::Exploring, measured::Measured};
 
     /// The events of a file, both checksums of each verified.
     fn read(bytes: &[u8]) -> Vec<Event> {
@@ -266,18 +264,13 @@ mod tests {
         let folder = folder.path().join("tensorboard");
         let mut events = EventFile::create(&folder, &Position::default(), 0).unwrap();
         events.write(&evaluation(0));
-        let losses = LossLine {
-            td_loss: 0.5,
-            contrastive_loss: 0.25,
-            grad_norm: 3.0,
-            q_total_mean: 0.0,
-            target_mean: -1.5,
-        };
+        let measured = [("td_loss", 0.5), ("grad_norm", 3.0), ("q_total_mean", 0.0), ("target_mean", -1.5)];
+        let measured = Measured(measured.map(|(name, value)| (name.to_owned(), value)).to_vec());
         let exploring = Some(Exploring { episodes_total: 9, policy_lag: 1 });
         let result =
             TaskResult { task: String::new(), episodes: 9, mean_return: 4.5, win_rate: None, exploring };
         let tasks = BTreeMap::from([("3v3".to_owned(), result)]);
-        let line = Line::Training { progress: progress(100), wall_s: 2.0, epsilon: 0.125, losses, tasks };
+        let line = Line::Training { progress: progress(100), wall_s: 2.0, epsilon: 0.125, measured, tasks };
         events.write(&line);
         let files = read_all(&folder);
         assert_eq!(files.len(), 1);
@@ -287,7 +280,6 @@ mod tests {
             (0, "greedy_return/game-1", -2.5),
             (0, "greedy_win_rate/game-1", 0.75),
             (100, "training/td_loss", 0.5),
-            (100, "training/contrastive_loss", 0.25),
             (100, "training/grad_norm", 3.0),
             (100, "training/q_total_mean", 0.0),
             (100, "training/target_mean", -1.5),

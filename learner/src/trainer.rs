@@ -5,6 +5,7 @@ use crate::{
     checkpoint::{Loaded, Manifest, Progress, SnapshotMark, TrainingState},
     evaluation::{Evaluator, TaskResult, by_task, in_words},
     ledger::Terms,
+    measured::Measured,
     metrics::{Follower, Line, MetricsFile, Recent},
     replay::Replay,
     tensorboard::{EventFile, Position},
@@ -12,7 +13,10 @@ use crate::{
     weights_file,
     writer::{ToWrite, Written},
 };
-use rit_algo::{Acting, Losses, Rit, Update};
+use rit_algo::{
+    Acting, Learner,
+    learner::{Draw, NamedState, NotFinite, StateError},
+};
 use rit_config::{Config, RunDir, Until};
 use rit_env::Split;
 use rit_episode::{Episode, RunSeed, Stream};
@@ -54,8 +58,8 @@ pub struct Checkpointed {
 pub struct Standing {
     /// How far it has come.
     pub progress: Progress,
-    /// Losses of the last update.
-    pub losses: Losses,
+    /// What the last update reported, in the learner's order; nothing before the first update.
+    pub measured: Measured,
     /// Exploring episodes of late.
     pub recent: Vec<TaskResult>,
     /// The newest scheduled evaluation, with the progress it was made at.
@@ -101,20 +105,27 @@ pub enum TrainError {
         /// Why.
         error: io::Error,
     },
-    /// The update's threads could not be started.
-    #[error("cannot start the update's threads: {0}")]
-    Threads(String),
-    /// The weights are no numbers any more.
-    #[error("the loss is not finite after {0} updates; a smaller algorithm.lr may help")]
-    NotFinite(u64),
+    /// A checkpoint that is not this learner's.
+    #[error("the checkpoint cannot be gone on from: {0}")]
+    State(#[from] StateError),
+    /// An update that would make weights that are no numbers.
+    #[error(
+        "{error} in update {update}; no weight has taken it over, and the newest checkpoint is whole: a smaller \
+         algorithm.lr or algorithm.grad_norm_clip may help"
+    )]
+    NotFinite {
+        /// Its number, from 1.
+        update: u64,
+        /// What is not finite.
+        error: NotFinite,
+    },
 }
 
 /// The trainer.
 pub struct Trainer {
     config: Config,
     run_dir: RunDir,
-    rit: Arc<Rit>,
-    update: Update,
+    learner: Box<dyn Learner>,
     replay: Replay,
     board: Arc<WeightsBoard>,
     evaluator: Evaluator,
@@ -148,20 +159,17 @@ impl Trainer {
     /// weights on. `news` must not wait.
     ///
     /// # Errors
-    /// When the metrics files or the update's threads cannot be had.
+    /// When the metrics files cannot be had, or the checkpoint is not this learner's.
     pub fn new(
         config: Config,
         run_dir: RunDir,
-        rit: Arc<Rit>,
+        learner: Box<dyn Learner>,
         loaded: Option<Loaded>,
         news: Box<dyn FnMut(News) + Send>,
         writer: mpsc::Sender<ToWrite>,
     ) -> Result<(Self, Arc<WeightsBoard>), TrainError> {
-        let params = rit.layout.initial(&mut config.seed.stream(Stream::Weights, 0));
-        let update = Update::new(Arc::clone(&rit), config.update(), params)
-            .map_err(|error| TrainError::Threads(error.to_string()))?;
         let lag = config.algorithm.policy_lag;
-        let first = Snapshot::new(0, 0, &update.params[rit.acting()]);
+        let first = Snapshot::new(0, 0, acting_params(&*learner));
         let first_terms = Terms { weights_version: 0, epsilon: config.epsilon(0) };
         let task_set = config.environment.task_set;
         let tasks = task_set.tasks(Split::Training).iter().map(ToString::to_string).collect();
@@ -179,13 +187,12 @@ impl Trainer {
             env_steps_before: 0,
             news,
             writer,
-            rit,
-            update,
+            learner,
             run_dir,
             config,
         };
         if let Some(loaded) = loaded {
-            trainer.go_on_from(loaded);
+            trainer.go_on_from(loaded)?;
         }
         let board = Arc::clone(&trainer.board);
         Ok((trainer, board))
@@ -205,13 +212,9 @@ impl Trainer {
         }
     }
 
-    fn go_on_from(&mut self, loaded: Loaded) {
-        let TrainingState { params, target, mean, mean_square, snapshots, manifest } = loaded.state;
-        self.update.params = params;
-        self.update.target = target;
-        self.update.optimizer.mean = mean;
-        self.update.optimizer.mean_square = mean_square;
-        self.update.optimizer.steps = manifest.progress.updates;
+    fn go_on_from(&mut self, loaded: Loaded) -> Result<(), StateError> {
+        let TrainingState { params, learner, snapshots, manifest } = loaded.state;
+        self.learner.restore(&params, &learner)?;
         self.target_copied_at = manifest.target_copied_at;
         self.terms = manifest.terms.into();
         let mut snapshots = snapshots.into_iter();
@@ -224,13 +227,14 @@ impl Trainer {
         let named = |(task, result): (String, TaskResult)| TaskResult { task, ..result };
         self.standing = Standing {
             progress: manifest.progress,
-            losses: Losses::default(),
+            measured: Measured::default(),
             recent: self.recent.results(),
             evaluation: manifest
                 .evaluation
                 .map(|(at, results)| (at, results.into_iter().map(named).collect())),
             replay_episodes: self.replay.len(),
         };
+        Ok(())
     }
 
     /// Works until the run is over or nobody can ask any more, then writes checkpoint and summary.
@@ -296,20 +300,18 @@ impl Trainer {
             self.replay.insert(episode);
         }
         if self.replay.len() >= algorithm.batch_size {
-            let seed = self.config.seed;
-            let batch =
-                self.replay.sample(algorithm.batch_size, &mut seed.stream(Stream::Replay, progress.updates));
-            let pairing = &mut seed.stream(Stream::Pairing, progress.updates);
-            self.standing.losses = self.update.step(&batch, pairing);
+            let draw = Draw { seed: self.config.seed, update: progress.updates };
+            let batch = self.replay.sample(algorithm.batch_size, &mut draw.stream(Stream::Replay));
+            let learned = self.learner.learn(&batch, draw);
             progress.updates += 1;
-            if !self.standing.losses.grad_norm.is_finite() {
-                return Err(TrainError::NotFinite(progress.updates));
-            }
+            let values =
+                learned.map_err(|error| TrainError::NotFinite { update: progress.updates, error })?;
+            self.standing.measured = Measured::new(self.learner.measures(), &values);
             if progress.episodes - self.target_copied_at >= algorithm.target_update_interval {
-                self.update.update_target();
+                self.learner.update_target();
                 self.target_copied_at = progress.episodes;
             }
-            let acting = &self.update.params[self.rit.acting()];
+            let acting = acting_params(&*self.learner);
             self.board.publish(Snapshot::new(progress.updates, progress.env_steps, acting));
         }
         let after = *progress;
@@ -321,7 +323,7 @@ impl Trainer {
                 progress: after,
                 wall_s: self.metrics.wall_s(),
                 epsilon: self.config.epsilon(after.env_steps).into(),
-                losses: standing.losses.into(),
+                measured: standing.measured.clone(),
                 tasks: by_task(&standing.recent),
             };
             self.measured(&line)?;
@@ -351,7 +353,7 @@ impl Trainer {
     }
 
     fn greedy(&self, episodes: usize) -> Vec<TaskResult> {
-        let mut acting = Acting::new(Arc::clone(&self.rit), &self.update.params[self.rit.acting()]);
+        let mut acting = Acting::new(self.learner.model(), acting_params(&*self.learner));
         let tasks = self.config.environment.task_set.tasks(Split::Training);
         self.evaluator.evaluate(&mut acting, &tasks, episodes, evaluation_seed(&self.config))
     }
@@ -381,7 +383,7 @@ impl Trainer {
     fn checkpoint(&mut self, done: Option<oneshot::Sender<Written>>) -> String {
         // What the disk still refuses, it will refuse the checkpoint too, which then says so.
         let _ = self.metrics.flush().and_then(|()| self.tensorboard.flush());
-        let weights_digest = weights_file::digest(&self.update.params);
+        let weights_digest = weights_file::digest(self.learner.params());
         let kept = self.board.all_kept();
         let mark = |snapshot: &Arc<Snapshot>| SnapshotMark {
             version: snapshot.version,
@@ -391,10 +393,8 @@ impl Trainer {
             (*at, results.iter().map(|result| (result.task.clone(), result.clone())).collect())
         });
         let state = TrainingState {
-            params: self.update.params.clone(),
-            target: self.update.target.clone(),
-            mean: self.update.optimizer.mean.clone(),
-            mean_square: self.update.optimizer.mean_square.clone(),
+            params: self.learner.params().to_vec(),
+            learner: self.learner.state().into_iter().map(NamedState::into_owned).collect(),
             manifest: Manifest {
                 progress: self.standing.progress,
                 target_copied_at: self.target_copied_at,
@@ -434,6 +434,11 @@ impl Trainer {
         written.map_err(|error| TrainError::Io { path, error })?;
         Ok(summary)
     }
+}
+
+/// The weights that actors need.
+fn acting_params(learner: &dyn Learner) -> &[f32] {
+    &learner.params()[learner.model().acting()]
 }
 
 /// The files that show how training goes: begun, or continued from a checkpoint.

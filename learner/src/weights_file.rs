@@ -1,7 +1,7 @@
 //! Weights on disk: safetensors under the specification's parameter names. The file carries the digest of its
 //! numbers, so what was altered is noticed.
 
-use rit_algo::Rit;
+use rit_nn::Layout;
 use safetensors::{Dtype, SafeTensorError, SafeTensors, tensor::TensorView};
 use sha2::{Digest as _, Sha256};
 use std::{
@@ -69,10 +69,10 @@ fn to_bytes(params: &[f32]) -> Vec<u8> {
 ///
 /// # Errors
 /// Never for a layout of our own making.
-pub fn encode(rit: &Rit, params: &[f32]) -> Result<Vec<u8>, SafeTensorError> {
+pub fn encode(layout: &Layout, params: &[f32]) -> Result<Vec<u8>, SafeTensorError> {
     let bytes = to_bytes(params);
     let mut tensors = Vec::new();
-    for param in rit.layout.params() {
+    for param in layout.params() {
         let data = &bytes[4 * param.range.start..4 * param.range.end];
         let view = TensorView::new(Dtype::F32, param.shape.clone(), data)?;
         tensors.push((param.name.as_str(), view));
@@ -82,18 +82,18 @@ pub fn encode(rit: &Rit, params: &[f32]) -> Result<Vec<u8>, SafeTensorError> {
     safetensors::serialize(tensors, Some(metadata))
 }
 
-/// Reads weights for this model.
+/// Reads weights of a model of this layout.
 ///
 /// # Errors
 /// When the file is not there, not whole, altered, or of another model.
-pub fn load(path: &Path, rit: &Rit) -> Result<Vec<f32>, WeightsFileError> {
+pub fn load(path: &Path, layout: &Layout) -> Result<Vec<f32>, WeightsFileError> {
     let path = path.to_owned();
     let bytes = fs::read(&path).map_err(|error| WeightsFileError::Io { path: path.clone(), error })?;
     let format = |error| WeightsFileError::Format { path: path.clone(), error };
     let tensors = SafeTensors::deserialize(&bytes).map_err(format)?;
     let other = |difference| WeightsFileError::OtherModel { path: path.clone(), difference };
-    let mut params = Vec::with_capacity(rit.layout.len());
-    for param in rit.layout.params() {
+    let mut params = Vec::with_capacity(layout.len());
+    for param in layout.params() {
         let Ok(tensor) = tensors.tensor(&param.name) else {
             return Err(other(format!("there is no {}", param.name)));
         };
@@ -107,8 +107,7 @@ pub fn load(path: &Path, rit: &Rit) -> Result<Vec<f32>, WeightsFileError> {
         }
         params.extend(tensor.data().as_chunks::<4>().0.iter().map(|&word| f32::from_le_bytes(word)));
     }
-    if let Some(name) =
-        tensors.names().iter().find(|name| !rit.layout.params().iter().any(|p| p.name == **name))
+    if let Some(name) = tensors.names().iter().find(|name| !layout.params().iter().any(|p| p.name == **name))
     {
         return Err(other(format!("there is {name} too")));
     }
@@ -123,52 +122,55 @@ pub fn load(path: &Path, rit: &Rit) -> Result<Vec<f32>, WeightsFileError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use rit_algo::Model;
     use rit_episode::{RunSeed, Stream};
 
-    fn model(settings: &[&str]) -> (Rit, Vec<f32>) {
+    fn model(settings: &[&str]) -> (Model, Vec<f32>) {
         let settings: Vec<_> = settings.iter().map(|text| rit_config::set(text).unwrap()).collect();
         let config =
             rit_config::resolve("environment.task_set = \"matrix-game\"", "test", &settings).unwrap();
-        let rit = Rit::new(config.rit()).unwrap();
-        let params = rit.layout.initial(&mut RunSeed(1).stream(Stream::Weights, 0));
-        (rit, params)
+        let model = Model::new(config.model()).unwrap();
+        let params = model.initial(&mut RunSeed(1).stream(Stream::Weights, 0));
+        (model, params)
     }
 
     #[test]
     fn weights_come_back_and_make_the_same_bytes() {
-        let (rit, params) = model(&[]);
+        let (model, params) = model(&[]);
+        let layout = model.layout();
         let file = tempfile::NamedTempFile::new().unwrap();
-        let bytes = encode(&rit, &params).unwrap();
+        let bytes = encode(layout, &params).unwrap();
         fs::write(file.path(), &bytes).unwrap();
-        assert_eq!(load(file.path(), &rit).unwrap(), params);
-        assert_eq!(encode(&rit, &params).unwrap(), bytes);
+        assert_eq!(load(file.path(), layout).unwrap(), params);
+        assert_eq!(encode(layout, &params).unwrap(), bytes);
     }
 
     #[test]
     fn what_is_not_these_weights_is_refused_and_named() {
-        let (rit, params) = model(&[]);
+        let (this, params) = model(&[]);
+        let layout = this.layout();
         let file = tempfile::NamedTempFile::new().unwrap();
-        let good = encode(&rit, &params).unwrap();
-        let error = |bytes: &[u8], rit: &Rit| {
+        let good = encode(layout, &params).unwrap();
+        let error = |bytes: &[u8], layout: &Layout| {
             fs::write(file.path(), bytes).unwrap();
-            load(file.path(), rit).unwrap_err().to_string()
+            load(file.path(), layout).unwrap_err().to_string()
         };
 
         let (other, _) = model(&["network.hidden_dim=32"]);
-        let message = error(&good, &other);
+        let message = error(&good, other.layout());
         assert!(message.contains("utility.embed.weight is [64, 6] F32, not [32, 6] F32"), "{message}");
         let (sum, _) = model(&["algorithm.mixing=sum"]);
-        assert!(error(&good, &sum).contains("there is mixer."));
+        assert!(error(&good, sum.layout()).contains("there is mixer."));
         let (no_z, _) = model(&["algorithm.task_representations=false"]);
-        assert!(error(&good, &no_z).contains("utility.head_hidden.weight is [64, 160]"));
+        assert!(error(&good, no_z.layout()).contains("utility.head_hidden.weight is [64, 160]"));
 
         for length in [0, 4, 8, 100, good.len() / 2, good.len() - 1] {
-            assert!(error(&good[..length], &rit).contains("no whole safetensors file"), "{length}");
+            assert!(error(&good[..length], layout).contains("no whole safetensors file"), "{length}");
         }
         let mut altered = good.clone();
         *altered.last_mut().unwrap() ^= 1;
-        assert!(error(&altered, &rit).contains("was altered"));
-        let nowhere = load(Path::new("/no/such/file"), &rit).unwrap_err().to_string();
+        assert!(error(&altered, layout).contains("was altered"));
+        let nowhere = load(Path::new("/no/such/file"), layout).unwrap_err().to_string();
         assert!(nowhere.contains("No such file"));
     }
 }

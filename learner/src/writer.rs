@@ -9,7 +9,7 @@ use crate::{
     coordinator::Event,
     replay_log::ReplayLog,
 };
-use rit_algo::Rit;
+use rit_algo::Model;
 use rit_config::RunDir;
 use rit_episode::Episode;
 use std::{
@@ -49,7 +49,7 @@ pub struct Writer {
     /// Where the run lies.
     pub run_dir: RunDir,
     /// Whose weights are written.
-    pub rit: Arc<Rit>,
+    pub model: Arc<Model>,
     /// Replay on disk.
     pub log: ReplayLog,
     /// Episodes that replay holds.
@@ -108,7 +108,7 @@ impl Writer {
     fn checkpoint(&mut self, waiting: &mut VecDeque<Arc<Episode>>, state: &TrainingState) -> Written {
         self.append(waiting)?;
         self.log.sync()?;
-        let path = checkpoint::save(&self.run_dir, &self.rit, state, self.keep)?;
+        let path = checkpoint::save(&self.run_dir, &self.model, state, self.keep)?;
         self.log.forget_before(checkpoint::replay_needed_from(&self.run_dir, self.buffer_size)?)?;
         Ok(path)
     }

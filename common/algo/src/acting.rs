@@ -3,6 +3,7 @@
 use crate::{
     Rit, Rows,
     decoder::{Decoder, DecoderState, Seen, Tables, best},
+    methods::Actor,
     task_encoder::TaskEncoderState,
     utility::UtilityState,
 };
@@ -11,7 +12,7 @@ use rit_nn::{Scratch, View, vectorized};
 use std::sync::Arc;
 
 /// A policy of the networks, ε-greedy. Holds only what acting needs: utility network and task encoder.
-pub struct Acting {
+pub struct RitActing {
     rit: Arc<Rit>,
     params: Vec<f32>,
     tables: Tables,
@@ -33,7 +34,7 @@ struct Memory {
     task_encoder: Vec<f32>,
 }
 
-impl Acting {
+impl RitActing {
     /// Acts with the given acting parameters (see [`Rit::acting`]).
     pub fn new(rit: Arc<Rit>, params: &[f32]) -> Self {
         let mut acting = Self {
@@ -51,17 +52,6 @@ impl Acting {
         acting
     }
 
-    /// Takes other weights. Between episodes only: a running one would go on with histories of the old.
-    ///
-    /// # Panics
-    /// When there are not as many as acting needs.
-    pub fn set_params(&mut self, params: &[f32]) {
-        assert_eq!(params.len(), self.rit.acting().len(), "the parameters that acting needs");
-        self.params.clear();
-        self.params.extend_from_slice(params);
-        self.tables = self.rit.utility.decoder.tables(&self.params);
-    }
-
     /// The utilities of the last [`Policy::act`], turn after turn, `[agent rows, A]`: each row's Q given the
     /// actions that were chosen before it.
     pub fn utilities(&self) -> &[f32] {
@@ -74,7 +64,16 @@ impl Acting {
     }
 }
 
-impl Policy for Acting {
+impl Actor for RitActing {
+    fn set_params(&mut self, params: &[f32]) {
+        assert_eq!(params.len(), self.rit.acting().len(), "the parameters that acting needs");
+        self.params.clear();
+        self.params.extend_from_slice(params);
+        self.tables = self.rit.utility.decoder.tables(&self.params);
+    }
+}
+
+impl Policy for RitActing {
     fn begin(&mut self, slot: usize, n_agents: usize) {
         if self.memories.len() <= slot {
             self.memories.resize_with(slot + 1, Memory::default);

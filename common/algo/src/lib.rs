@@ -1,17 +1,24 @@
 //! RIT: representing interactions and tasks. This crate knows no transport and does no IO.
 //!
+//! - [`Method`]: the algorithms there are. [`Model`]: one's networks. [`Learner`]: one under training, and all that
+//!   a trainer knows of it. [`Acting`]: its networks choosing joint actions.
 //! - [`Rows`]: the rows of a batch that exist, in the order the networks work on them.
-//! - [`Rit`]: the model's parts and the layout of its parameters; [`RitConfig`] says which parts it has.
+//! - [`Rit`]: RIT's parts and the layout of its parameters; [`RitConfig`] says which parts it has.
 //! - [`encoder`], [`utility`], [`decoder`], [`task_encoder`], [`mixer`], [`contrastive`]: the parts, each
 //!   forward with its backward below it.
 //! - [`Update`]: one training step, from a batch of episodes to new weights.
-//! - [`Acting`]: the same networks choosing joint actions, one row after another.
+//! - [`RitActing`]: the same networks choosing joint actions, one row after another.
 
-pub mod acting;
+mod acting;
+mod config;
 pub mod contrastive;
 pub mod decoder;
 pub mod encoder;
+pub mod learner;
+pub mod method;
+mod methods;
 pub mod mixer;
+mod model;
 mod rit;
 mod rows;
 pub mod task_encoder;
@@ -19,7 +26,12 @@ pub mod td;
 mod update;
 pub mod utility;
 
-pub use acting::Acting;
-pub use rit::{ConfigError, Mixing, Networks, Rit, RitConfig, TaskRepresentations};
+pub use acting::RitActing;
+pub use config::{ConfigError, ModelConfig};
+pub use learner::Learner;
+pub use method::{Method, Regime};
+pub use methods::{Acting, learner};
+pub use model::Model;
+pub use rit::{Mixing, Networks, Rit, RitConfig, TaskRepresentations};
 pub use rows::{Rows, Step, TerminalStates};
 pub use update::{Losses, Seen, Update, UpdateConfig};

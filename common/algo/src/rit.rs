@@ -1,6 +1,7 @@
 //! The model: which parts it has, and the layout of their parameters.
 
 use crate::{
+    ConfigError,
     contrastive::Discriminator,
     decoder::Tables,
     mixer::{Mixer, MixerState},
@@ -51,25 +52,6 @@ pub enum Mixing {
     },
     /// Their sum: RIT-VDN.
     Sum,
-}
-
-/// A size that no model can have.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum ConfigError {
-    /// A size of zero.
-    #[error("{name} is 0; it must be at least 1")]
-    Zero {
-        /// Its name.
-        name: &'static str,
-    },
-    /// Heads that do not split the attention evenly.
-    #[error("attention_dim {attention_dim} is not a multiple of n_heads {n_heads}")]
-    Heads {
-        /// a.
-        attention_dim: usize,
-        /// Heads.
-        n_heads: usize,
-    },
 }
 
 impl RitConfig {

@@ -113,9 +113,14 @@ impl Update {
     /// One update on a batch; `rng` draws the contrastive loss's pairing.
     pub fn step(&mut self, batch: &[&Episode], rng: &mut (impl Rng + Send)) -> Losses {
         let losses = self.gradients(batch, |rows| contrastive::draw_pairing(rows, rng));
-        let scale = optimizer::clip_scale(losses.grad_norm, self.config.grad_norm_clip);
-        self.optimizer.step(&mut self.params, &self.grads, scale);
+        self.apply(losses.grad_norm);
         losses
+    }
+
+    /// One step of the optimiser along the gradients that [`Update::gradients`] left, which are of this norm.
+    pub fn apply(&mut self, grad_norm: f64) {
+        let scale = optimizer::clip_scale(grad_norm, self.config.grad_norm_clip);
+        self.optimizer.step(&mut self.params, &self.grads, scale);
     }
 
     /// Losses and gradients of a batch, without a step; `pairing` makes a permutation of so many rows.

@@ -4,7 +4,7 @@
 
 use rand::RngExt as _;
 use rit_algo::{
-    Acting, Mixing, Rit, RitConfig, Seen, TaskRepresentations, TerminalStates, Update, UpdateConfig,
+    Mixing, Rit, RitActing, RitConfig, Seen, TaskRepresentations, TerminalStates, Update, UpdateConfig,
     contrastive::draw_pairing,
 };
 use rit_episode::{
@@ -132,7 +132,7 @@ fn every_parameters_gradient_is_the_numeric_one() {
 
 /// Plays an episode's observations to a policy, step by step, and forces the recorded actions by making
 /// nothing else available.
-fn replay(acting: &mut Acting, slots: &[(usize, &Episode)]) -> Vec<Vec<f32>> {
+fn replay(acting: &mut RitActing, slots: &[(usize, &Episode)]) -> Vec<Vec<f32>> {
     let mut utilities = vec![vec![]; slots.len()];
     for &(slot, episode) in slots {
         acting.begin(slot, episode.n_agents);
@@ -200,7 +200,7 @@ fn acting_row_by_row_equals_the_masked_parallel_pass() {
         };
         update.gradients_seen(&batch, |rows| (0..rows).collect(), see);
         let trained = trained.into_inner().unwrap();
-        let mut acting = Acting::new(Arc::clone(&rit), &at[rit.acting()]);
+        let mut acting = RitActing::new(Arc::clone(&rit), &at[rit.acting()]);
         let slots: Vec<_> = batch.iter().copied().enumerate().collect();
         for ((index, episode), acted) in slots.iter().zip(replay(&mut acting, &slots)) {
             for time in 0..episode.steps() {
@@ -220,9 +220,9 @@ fn acting_does_not_depend_on_company() {
     let at = params(&rit, 3);
     let episodes = batch(13);
     let together: Vec<_> = episodes.iter().enumerate().collect();
-    let all = replay(&mut Acting::new(Arc::clone(&rit), &at[rit.acting()]), &together);
+    let all = replay(&mut RitActing::new(Arc::clone(&rit), &at[rit.acting()]), &together);
     for (index, episode) in episodes.iter().enumerate() {
-        let alone = replay(&mut Acting::new(Arc::clone(&rit), &at[rit.acting()]), &[(3, episode)]);
+        let alone = replay(&mut RitActing::new(Arc::clone(&rit), &at[rit.acting()]), &[(3, episode)]);
         assert_eq!(alone[0], all[index], "episode {index}, bit for bit");
     }
 }

@@ -1,7 +1,7 @@
 //! The resolved configuration: complete, and within its limits. `presets/all.toml` says what each key means.
 
 use crate::ConfigError;
-use rit_algo::{Mixing, RitConfig, TaskRepresentations, TerminalStates, UpdateConfig};
+use rit_algo::{Method, ModelConfig, TerminalStates, UpdateConfig, method::Encoder};
 use rit_env::{EnvironmentOptions, TaskSet};
 use rit_episode::RunSeed;
 use rit_nn::OptimizerKind;
@@ -252,26 +252,27 @@ impl Config {
         toml::to_string(self).map_err(|error| ConfigError::Value(error.to_string()))
     }
 
-    /// The model's sizes and parts.
-    pub fn rit(&self) -> RitConfig {
+    /// The model's method and sizes.
+    pub fn model(&self) -> ModelConfig {
         let (dims, network) = (self.environment.task_set.dims(), &self.network);
-        RitConfig {
+        let method = match (self.algorithm.mixing, self.algorithm.task_representations) {
+            (MixingKind::Network, true) => Method::Rit,
+            (MixingKind::Sum, true) => Method::RitVdn,
+            (MixingKind::Network, false) => Method::RitNoTaskRepresentations,
+            (MixingKind::Sum, false) => Method::VdnInt,
+        };
+        ModelConfig {
+            method,
+            encoder: Encoder::Beside,
             entity_dim: dims.entity_dim,
             n_actions: dims.n_actions,
             hidden_dim: network.hidden_dim,
             attention_dim: network.attention_dim,
             n_heads: network.n_heads,
-            task_representations: self.algorithm.task_representations.then_some(TaskRepresentations {
-                dim: network.task_representation_dim,
-                reward_embed_dim: network.reward_embed_dim,
-            }),
-            mixing: match self.algorithm.mixing {
-                MixingKind::Network => Mixing::Network {
-                    mixing_embed_dim: network.mixing_embed_dim,
-                    hypernet_embed_dim: network.hypernet_embed_dim,
-                },
-                MixingKind::Sum => Mixing::Sum,
-            },
+            task_representation_dim: network.task_representation_dim,
+            reward_embed_dim: network.reward_embed_dim,
+            mixing_embed_dim: network.mixing_embed_dim,
+            hypernet_embed_dim: network.hypernet_embed_dim,
         }
     }
 

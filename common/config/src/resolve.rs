@@ -119,7 +119,7 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
     if let Some(&(key, _)) = meaningless.iter().find(|(_, meaningless)| *meaningless) {
         return Err(ConfigError::Meaningless { key, task_set });
     }
-    config.rit().validate()?;
+    config.model().validate()?;
     Ok(config)
 }
 

@@ -1,8 +1,8 @@
 //! One learner update, as training makes it.
 
-use super::{Model, Report, cpu_s, random_episodes, thread_cpu_s};
+use super::{Measured, Report, cpu_s, random_episodes, thread_cpu_s};
 use crate::failure::Failure;
-use rit_algo::Update;
+use rit_algo::{Learner, learner::Draw};
 use rit_env::{Split, Task};
 use rit_episode::Stream;
 use rit_learner::replay::Replay;
@@ -27,11 +27,11 @@ pub(super) struct Cost {
     pub replay_bytes: usize,
 }
 
-pub(super) fn run(model: &Model, duration: Duration) -> Result<Report, Failure> {
-    let config = &model.config;
+pub(super) fn run(measured: &Measured, duration: Duration) -> Result<Report, Failure> {
+    let config = &measured.config;
     let tasks = config.environment.task_set.tasks(Split::Training);
     let limit_before = large_product_flops();
-    let cost = measure(model, &tasks, config.algorithm.buffer_size, duration)?;
+    let cost = measure(measured, &tasks, config.algorithm.buffer_size, duration)?;
     // A shared machine's speed drifts: the limit is measured before and after.
     let limit = f64::midpoint(limit_before, large_product_flops());
 
@@ -54,13 +54,13 @@ pub(super) fn run(model: &Model, duration: Duration) -> Result<Report, Failure> 
 
 /// Makes updates from a replay of so many episodes of these tasks for so long, three at least.
 pub(super) fn measure(
-    Model { config, rit, params }: &Model,
+    Measured { config, model, params }: &Measured,
     tasks: &[Task],
     replay_episodes: usize,
     duration: Duration,
 ) -> Result<Cost, Failure> {
-    let update = Update::new(Arc::clone(rit), config.update(), params.clone());
-    let mut update = update.map_err(Failure::runtime)?;
+    let learner = rit_algo::learner(Arc::clone(model), config.update(), params.clone());
+    let mut learner = learner.map_err(Failure::runtime)?;
     let mut replay = Replay::new(replay_episodes);
     let mut replay_bytes = 0;
     for episode in random_episodes(config, tasks, replay_episodes as u64) {
@@ -69,19 +69,19 @@ pub(super) fn measure(
     }
 
     let mut number = 0;
-    let mut one_update = |update: &mut Update| {
-        let batch =
-            replay.sample(config.algorithm.batch_size, &mut config.seed.stream(Stream::Replay, number));
-        update.step(&batch, &mut config.seed.stream(Stream::Pairing, number));
+    let mut one_update = |learner: &mut dyn Learner| {
+        let draw = Draw { seed: config.seed, update: number };
+        let batch = replay.sample(config.algorithm.batch_size, &mut draw.stream(Stream::Replay));
         number += 1;
+        learner.learn(&batch, draw).map_err(Failure::runtime)
     };
     for _ in 0..3 {
-        one_update(&mut update);
+        one_update(&mut *learner)?;
     }
     let (cpu, wall, flops) = (cpu_s(), Instant::now(), matmul::flops());
     let mut updates = 0;
     while wall.elapsed() < duration || updates < 3 {
-        one_update(&mut update);
+        one_update(&mut *learner)?;
         updates += 1;
     }
     Ok(Cost {
@@ -89,7 +89,7 @@ pub(super) fn measure(
         cpu_s: cpu_s() - cpu,
         wall_s: wall.elapsed().as_secs_f64(),
         flops: matmul::flops() - flops,
-        parameters: rit.layout.len(),
+        parameters: model.layout().len(),
         replay_episodes: replay.len(),
         replay_bytes,
     })

@@ -15,7 +15,7 @@ use crate::{
     failure::Failure,
     player::Trained,
 };
-use rit_algo::Rit;
+use rit_algo::Model;
 use rit_config::Config;
 use rit_env::{
     Task,
@@ -30,14 +30,14 @@ use std::{process::ExitCode, sync::Arc, time::Duration};
 /// `rit bench`.
 #[allow(clippy::print_stdout, reason = "what the command is for")]
 pub fn run(options: &BenchOptions) -> Result<ExitCode, Failure> {
-    let model = Model::new(options)?;
+    let measured = Measured::new(options)?;
     let duration = Duration::from_secs_f64(options.seconds);
     let mut report = match options.kind {
-        BenchKind::Learner => learner::run(&model, duration)?,
-        BenchKind::Rollout => rollout::run(&model, duration)?,
-        BenchKind::Env => env::run(&model.config, duration),
+        BenchKind::Learner => learner::run(&measured, duration)?,
+        BenchKind::Rollout => rollout::run(&measured, duration)?,
+        BenchKind::Env => env::run(&measured.config, duration),
         BenchKind::Ipc => ipc::run(options.payload_kib, duration)?,
-        BenchKind::Scale => scale::run(&model, &options.experiment, &options.settings, duration)?,
+        BenchKind::Scale => scale::run(&measured, &options.experiment, &options.settings, duration)?,
     };
     report.insert("bench".into(), options.kind.to_string().into());
     if let Some(run) = &options.run {
@@ -64,20 +64,20 @@ pub fn run(options: &BenchOptions) -> Result<ExitCode, Failure> {
 }
 
 /// Whose networks are measured.
-struct Model {
+struct Measured {
     config: Config,
-    rit: Arc<Rit>,
+    model: Arc<Model>,
     params: Vec<f32>,
 }
 
-impl Model {
+impl Measured {
     /// An experiment's fresh networks, or those that a run has come to.
     fn new(options: &BenchOptions) -> Result<Self, Failure> {
         let Some(run) = &options.run else {
             let config = experiments::load(&options.experiment, &options.settings)?.config;
-            let rit = Arc::new(Rit::new(config.rit()).map_err(Failure::input)?);
-            let params = rit.layout.initial(&mut config.seed.stream(Stream::Weights, 0));
-            return Ok(Self { config, rit, params });
+            let model = Arc::new(Model::new(config.model()).map_err(Failure::input)?);
+            let params = model.initial(&mut config.seed.stream(Stream::Weights, 0));
+            return Ok(Self { config, model, params });
         };
         if !matches!(options.kind, BenchKind::Learner | BenchKind::Rollout) {
             let kind = options.kind;
@@ -85,8 +85,8 @@ impl Model {
                 "`rit bench {kind}` has no use for a run's weights; --run is for learner and rollout"
             )));
         }
-        let Trained { config, rit, params } = Trained::load(run)?;
-        Ok(Self { config, rit, params })
+        let Trained { config, model, params } = Trained::load(run)?;
+        Ok(Self { config, model, params })
     }
 }
 

@@ -1,6 +1,6 @@
 //! Rolling episodes as an actor does: environments, acting networks, recording. No transport.
 
-use super::{Model, Report, cpu_s};
+use super::{Measured, Report, cpu_s};
 use crate::failure::Failure;
 use rit_algo::Acting;
 use rit_config::Config;
@@ -9,10 +9,7 @@ use rit_env::{
     rollout::{Job, Rollout},
 };
 use rit_nn::matmul;
-use std::{
-    sync::Arc,
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
 /// What rolling costs.
 pub(super) struct Cost {
@@ -21,10 +18,10 @@ pub(super) struct Cost {
     pub flops: u64,
 }
 
-pub(super) fn run(model: &Model, duration: Duration) -> Result<Report, Failure> {
-    let config = &model.config;
+pub(super) fn run(measured: &Measured, duration: Duration) -> Result<Report, Failure> {
+    let config = &measured.config;
     let Cost { env_steps, cpu_s, flops } =
-        measure(model, config.environment.task_set.tasks(Split::Training), duration);
+        measure(measured, config.environment.task_set.tasks(Split::Training), duration);
     let mut report = Report::new();
     report.insert("env_steps_per_cpu_s".into(), (env_steps as f64 / cpu_s).into());
     report.insert("gemm_gflop_per_cpu_s".into(), (flops as f64 / cpu_s * 1e-9).into());
@@ -38,8 +35,12 @@ fn side_by_side(config: &Config) -> u64 {
 }
 
 /// Rolls episodes of these tasks for so long.
-pub(super) fn measure(Model { config, rit, params }: &Model, tasks: Vec<Task>, duration: Duration) -> Cost {
-    let mut acting = Acting::new(Arc::clone(rit), &params[rit.acting()]);
+pub(super) fn measure(
+    Measured { config, model, params }: &Measured,
+    tasks: Vec<Task>,
+    duration: Duration,
+) -> Cost {
+    let mut acting = Acting::new(model, &params[model.acting()]);
     let mut rollout =
         Rollout::new(tasks, config.environment_options(), config.seed, config.algorithm.random_permutation);
     let side_by_side = side_by_side(config);

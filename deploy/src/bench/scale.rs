@@ -1,6 +1,6 @@
 //! How costs grow: with agents, with entities, with actors.
 
-use super::{Model, Report, learner, rollout};
+use super::{Measured, Report, learner, rollout};
 use crate::failure::Failure;
 use rit_env::{Task, particle::PredatorPreyReward};
 use rustix::param::clock_ticks_per_second;
@@ -26,7 +26,7 @@ const STEPS_A_SECOND: f64 = 8_000.0;
 /// `agents`: cooperative navigation (n, n), agents and landmarks growing alike. `entities`: two predators, ever
 /// more prey. `actors`: whole short runs of the experiment, learner and all.
 pub(super) fn run(
-    model: &Model,
+    measured: &Measured,
     experiment: &str,
     settings: &[String],
     duration: Duration,
@@ -34,7 +34,7 @@ pub(super) fn run(
     let hunt = |prey| Task::PredatorPrey { predators: 2, prey, reward: PredatorPreyReward::Plain };
     let share = duration / (2 * SIZES.len() + ACTORS.len()) as u32;
     let grown = |task: fn(usize) -> Task| -> Result<Vec<Value>, Failure> {
-        SIZES.iter().map(|&size| costs(model, task(size), share)).collect()
+        SIZES.iter().map(|&size| costs(measured, task(size), share)).collect()
     };
     let mut report = Report::new();
     report.insert("agents".into(), grown(|n| Task::CooperativeNavigation { n })?.into());
@@ -45,10 +45,10 @@ pub(super) fn run(
 }
 
 /// What an update and a step cost on one task.
-fn costs(model: &Model, task: Task, duration: Duration) -> Result<Value, Failure> {
-    let replay_episodes = REPLAY_BATCHES * model.config.algorithm.batch_size;
-    let update = learner::measure(model, &[task], replay_episodes, duration / 2)?;
-    let rolling = rollout::measure(model, vec![task], duration / 2);
+fn costs(measured: &Measured, task: Task, duration: Duration) -> Result<Value, Failure> {
+    let replay_episodes = REPLAY_BATCHES * measured.config.algorithm.batch_size;
+    let update = learner::measure(measured, &[task], replay_episodes, duration / 2)?;
+    let rolling = rollout::measure(measured, vec![task], duration / 2);
     let (size, count) = (task.size(), f64::from(update.updates));
     Ok(json!({
         "task": task.to_string(),

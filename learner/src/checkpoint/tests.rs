@@ -4,11 +4,12 @@ use rit_episode::{
     RunSeed, Stream,
     wire::{PayloadLayout, TaskSize},
 };
+use std::sync::Arc;
 
 struct Run {
     _folder: tempfile::TempDir,
     run_dir: RunDir,
-    rit: Rit,
+    learner: Box<dyn Learner>,
     algorithm: Algorithm,
 }
 
@@ -17,22 +18,32 @@ fn run() -> Run {
     let folder = tempfile::tempdir().unwrap();
     let run_dir = RunDir::create(&folder.path().join("run"), &config).unwrap();
     let algorithm = Algorithm { buffer_size: 0, ..config.algorithm.clone() };
-    Run { _folder: folder, run_dir, rit: Rit::new(config.rit()).unwrap(), algorithm }
+    let model = Arc::new(Model::new(config.model()).unwrap());
+    let params = model.initial(&mut RunSeed(1).stream(Stream::Weights, 0));
+    let learner = rit_algo::learner(model, config.update(), params).unwrap();
+    Run { _folder: folder, run_dir, learner, algorithm }
 }
 
 impl Run {
     /// A state whose numbers tell which it is. Its run has a replay of no episodes.
     fn state(&self, env_steps: u64) -> TrainingState {
         let numbers = |len: usize, index: u64| -> Vec<f32> {
-            let layout = self.rit.layout.initial(&mut RunSeed(env_steps).stream(Stream::Weights, index));
+            let layout = self.learner.model().initial(&mut RunSeed(env_steps).stream(Stream::Weights, index));
             layout.into_iter().cycle().take(len).collect()
         };
-        let params = numbers(self.rit.layout.len(), 0);
-        let acting = numbers(self.rit.acting().len(), 1);
+        let params = numbers(self.learner.params().len(), 0);
+        let acting = numbers(self.learner.model().acting().len(), 1);
+        let learner =
+            self.learner.state().into_iter().enumerate().map(|(index, NamedState { name, numbers: its })| {
+                let numbers = match its {
+                    Numbers::F32(its) => Numbers::F32(numbers(its.len(), 2 + index as u64).into()),
+                    Numbers::F64(its) => Numbers::F64(vec![0.1 + 0.2; its.len()].into()),
+                    Numbers::U64(its) => Numbers::U64(vec![env_steps; its.len()].into()),
+                };
+                NamedState { name, numbers }
+            });
         TrainingState {
-            target: numbers(self.rit.target().len(), 2),
-            mean: vec![],
-            mean_square: numbers(params.len(), 3),
+            learner: learner.collect(),
             snapshots: vec![Snapshot::new(4, 90, &acting), Snapshot::new(5, 100, &acting)],
             manifest: Manifest {
                 progress: Progress { env_steps, episodes: 10, updates: 5 },
@@ -54,7 +65,9 @@ impl Run {
     }
 
     fn save(&self, env_steps: u64) -> PathBuf {
-        self.run_dir.root().join(save(&self.run_dir, &self.rit, &self.state(env_steps), 3).unwrap())
+        self.run_dir
+            .root()
+            .join(save(&self.run_dir, self.learner.model(), &self.state(env_steps), 3).unwrap())
     }
 
     fn load(&self) -> Result<Option<Loaded>, CheckpointError> {
@@ -62,7 +75,7 @@ impl Run {
         let layout = PayloadLayout::new(dims);
         let tasks = vec![TaskSize { n_agents: 2, n_entities: 2 }; 2];
         let expected = Expected { run_id: self.run_dir.run_id(), layout, tasks };
-        load_newest(&self.run_dir, &self.rit, &expected, &self.algorithm)
+        load_newest(&self.run_dir, &*self.learner, &expected, &self.algorithm)
     }
 }
 
@@ -76,7 +89,7 @@ fn a_state_comes_back_whole_and_latest_is_the_newest() {
     assert_eq!(loaded.state, run.state(100));
     assert!(loaded.damaged.is_empty());
     let latest = run.run_dir.checkpoints().join(LATEST);
-    assert_eq!(load(&latest, &run.rit, 2, &run.algorithm).unwrap(), run.state(100));
+    assert_eq!(load(&latest, &*run.learner, 2, &run.algorithm).unwrap(), run.state(100));
     run.save(100);
     assert_eq!(run.load().unwrap().unwrap().state, run.state(100), "once more by request");
 }

@@ -13,8 +13,9 @@ use std::time::Instant;
 
 impl Coordinator {
     pub(super) fn status(&self) -> v1::RunStatus {
-        let Standing { progress, losses, recent, evaluation, replay_episodes } = &self.standing;
+        let Standing { progress, measured, recent, evaluation, replay_episodes } = &self.standing;
         let now = Instant::now();
+        let of = |name| measured.get(name).unwrap_or_default();
         let messages = |results: &[TaskResult]| results.iter().map(TaskResult::to_message).collect();
         // All frames of a run have the same length.
         let frame_bytes =
@@ -27,9 +28,9 @@ impl Coordinator {
             updates: progress.updates,
             epsilon: self.epsilon.into(),
             wall_s: (now - self.started).as_secs_f64(),
-            td_loss: losses.td_loss,
-            contrastive_loss: losses.contrastive_loss,
-            grad_norm: losses.grad_norm,
+            td_loss: of("td_loss"),
+            contrastive_loss: of("contrastive_loss"),
+            grad_norm: of("grad_norm"),
             recent: messages(recent),
             evaluation: evaluation.as_ref().map(|(progress, results)| v1::Evaluation {
                 env_steps: progress.env_steps,
@@ -41,8 +42,8 @@ impl Coordinator {
             replay_episodes: *replay_episodes as u64,
             pid: std::process::id(),
             replay_episodes_max: self.config.algorithm.buffer_size as u64,
-            q_total_mean: losses.q_total_mean,
-            target_mean: losses.target_mean,
+            q_total_mean: of("q_total_mean"),
+            target_mean: of("target_mean"),
             rates: Some(self.rates.rates()),
             learner_waiting_s: self.learner_waiting.seconds(now),
             shared_memory_bytes: self.frames * frame_bytes as u64,

@@ -1,7 +1,7 @@
 //! A checkpoint and replay as they lie on disk: see [`rit_learner::checkpoint`].
 
 use crate::frame;
-use rit_algo::Rit;
+use rit_algo::{Learner, Model, learner::NamedState};
 use rit_config::{Config, RunDir};
 use rit_env::{Split, TaskSet};
 use rit_episode::{
@@ -59,7 +59,7 @@ pub struct Run {
     _folder: tempfile::TempDir,
     run_dir: RunDir,
     config: Config,
-    rit: Arc<Rit>,
+    model: Arc<Model>,
     expected: Expected,
     /// The batch that comes next.
     next: Vec<Episode>,
@@ -79,7 +79,7 @@ impl Run {
         RunDir::create(&root, &config)?;
         fs::write(root.join("run_id"), RUN_ID)?;
         let (run_dir, config) = RunDir::open(&root)?;
-        let rit = Arc::new(Rit::new(config.rit())?);
+        let model = Arc::new(Model::new(config.model())?);
         let tasks = TaskSet::MatrixGame.tasks(Split::Training);
         let layout = PayloadLayout::new(TaskSet::MatrixGame.dims());
         let tasks = tasks.into_iter().map(rit_env::Task::size).collect();
@@ -91,9 +91,9 @@ impl Run {
         for episode in &episodes {
             log.append(episode)?;
         }
-        checkpoint::save(&run_dir, &rit, &state(&rit, &config), 1)?;
+        checkpoint::save(&run_dir, &model, &state(&*learner(&model, &config)?, &config), 1)?;
         let whole = FILES.map(|name| fs::read(path(&run_dir, name)).unwrap_or_default());
-        Ok(Self { _folder: folder, run_dir, config, rit, expected, next, whole })
+        Ok(Self { _folder: folder, run_dir, config, model, expected, next, whole })
     }
 
     /// Reads the checkpoint with one file replaced, and says whether it was accepted. What is accepted, training can
@@ -122,12 +122,13 @@ impl Run {
 
     #[allow(clippy::panic, reason = "that is how a fuzzer learns of it")]
     fn load(&self) -> bool {
+        let Ok(learner) = learner(&self.model, &self.config) else { panic!("no threads") };
         let loaded =
-            checkpoint::load_newest(&self.run_dir, &self.rit, &self.expected, &self.config.algorithm);
+            checkpoint::load_newest(&self.run_dir, &*learner, &self.expected, &self.config.algorithm);
         let Ok(loaded) = loaded else { return false };
         let (to_write, _) = mpsc::channel();
-        let (run_dir, rit) = (self.run_dir.clone(), Arc::clone(&self.rit));
-        let trainer = Trainer::new(self.config.clone(), run_dir, rit, loaded, Box::new(|_| ()), to_write);
+        let run_dir = self.run_dir.clone();
+        let trainer = Trainer::new(self.config.clone(), run_dir, learner, loaded, Box::new(|_| ()), to_write);
         let Ok((trainer, board)) = trainer else { panic!("the trainer does not start") };
 
         let beginning = trainer.beginning();
@@ -154,7 +155,10 @@ impl Run {
         drop(work);
         // Nobody writes the last checkpoint. Whatever the weights were altered to, their loss need not be finite.
         let trained = trainer.run(&queue);
-        assert!(matches!(trained, Err(TrainError::Checkpoint(_) | TrainError::NotFinite(_))), "{trained:?}");
+        assert!(
+            matches!(trained, Err(TrainError::Checkpoint(_) | TrainError::NotFinite { .. })),
+            "{trained:?}"
+        );
         true
     }
 
@@ -189,14 +193,17 @@ fn path(run_dir: &RunDir, name: &str) -> PathBuf {
     run_dir.checkpoints().join(checkpoint::LATEST).join(Path::new(name))
 }
 
-fn state(rit: &Rit, config: &Config) -> TrainingState {
-    let params = rit.layout.initial(&mut config.seed.stream(Stream::Weights, 0));
-    let acting = &params[rit.acting()];
+fn learner(model: &Arc<Model>, config: &Config) -> Result<Box<dyn Learner>, Box<dyn std::error::Error>> {
+    let params = model.initial(&mut config.seed.stream(Stream::Weights, 0));
+    Ok(rit_algo::learner(Arc::clone(model), config.update(), params)?)
+}
+
+fn state(learner: &dyn Learner, config: &Config) -> TrainingState {
+    let params = learner.params().to_vec();
+    let acting = &params[learner.model().acting()];
     let lag = config.algorithm.policy_lag as u64;
     TrainingState {
-        target: params[rit.target()].to_vec(),
-        mean: vec![],
-        mean_square: vec![0.5; params.len()],
+        learner: learner.state().into_iter().map(NamedState::into_owned).collect(),
         snapshots: (UPDATES - lag..=UPDATES)
             .map(|version| Snapshot::new(version, 2 * version, acting))
             .collect(),

@@ -1,0 +1,70 @@
+//! The methods, each in a file of its own, and the one place that tells them apart.
+
+mod rit;
+
+use crate::{Learner, Model, RitActing, UpdateConfig, model::Network};
+use rayon::ThreadPoolBuildError;
+use rit_episode::{Policy, Turn};
+use std::sync::Arc;
+
+/// A method's learner that goes on from these parameters.
+///
+/// # Errors
+/// When the update's threads cannot be started.
+///
+/// # Panics
+/// When `params` is not of the layout's length.
+pub fn learner(
+    model: Arc<Model>,
+    update: UpdateConfig,
+    params: Vec<f32>,
+) -> Result<Box<dyn Learner>, ThreadPoolBuildError> {
+    match &model.network {
+        Network::Rit(rit) => {
+            let rit = Arc::clone(rit);
+            Ok(Box::new(rit::RitLearner::new(model, rit, update, params)?))
+        }
+    }
+}
+
+/// A method's networks choosing joint actions, for several running episodes at once.
+pub struct Acting(Box<dyn Actor>);
+
+/// What a method's acting networks must do.
+pub(crate) trait Actor: Policy + Send {
+    /// Takes other acting parameters. Between episodes only: a running one would go on with histories of the old.
+    ///
+    /// # Panics
+    /// When there are not as many as acting needs.
+    fn set_params(&mut self, params: &[f32]);
+}
+
+impl Acting {
+    /// Acts with these acting parameters (see [`Model::acting`]).
+    ///
+    /// # Panics
+    /// When there are not as many as acting needs.
+    pub fn new(model: &Model, params: &[f32]) -> Self {
+        match &model.network {
+            Network::Rit(rit) => Self(Box::new(RitActing::new(Arc::clone(rit), params))),
+        }
+    }
+
+    /// Takes other weights. Between episodes only: a running one would go on with histories of the old.
+    ///
+    /// # Panics
+    /// When there are not as many as acting needs.
+    pub fn set_params(&mut self, params: &[f32]) {
+        self.0.set_params(params);
+    }
+}
+
+impl Policy for Acting {
+    fn begin(&mut self, slot: usize, n_agents: usize) {
+        self.0.begin(slot, n_agents);
+    }
+
+    fn act(&mut self, turns: &mut [Turn<'_>]) {
+        self.0.act(turns);
+    }
+}
