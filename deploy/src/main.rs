@@ -20,6 +20,7 @@ mod shutdown;
 mod soak;
 mod supervisor;
 mod train;
+mod warnings;
 mod watch;
 
 use clap::{CommandFactory as _, Parser as _};

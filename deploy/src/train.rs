@@ -9,6 +9,7 @@ use crate::{
     progress::Progress,
     report, shutdown,
     supervisor::{Process, in_words},
+    warnings::Warnings,
 };
 use rit_config::{Config, RunDir};
 use rit_ipc::RunSpace;
@@ -39,7 +40,14 @@ pub async fn run(options: TrainOptions, logs: LogOptions) -> Result<ExitCode, Fa
     let root = run_dir.root().display();
     progress.say(&format!("{name}: learner and {} actors, run directory {root}", config.actors.count));
 
-    let mut run = Run { run_dir: &run_dir, logs: &logs, progress, actors: Vec::new(), web_url: None };
+    let mut run = Run {
+        run_dir: &run_dir,
+        logs: &logs,
+        progress,
+        warnings: Warnings::default(),
+        actors: Vec::new(),
+        web_url: None,
+    };
     let ended = run.watch(&config).await;
     run.end_actors().await;
     run.progress.finish();
@@ -101,6 +109,7 @@ struct Run<'a> {
     run_dir: &'a RunDir,
     logs: &'a LogOptions,
     progress: Progress,
+    warnings: Warnings,
     actors: Vec<Process>,
     /// The web page's address, once it was said.
     web_url: Option<String>,
@@ -139,6 +148,9 @@ impl Run<'_> {
                         self.kill_hung_actors(&status);
                         if !stopping {
                             self.adjust_actors(status.actors_wanted as usize)?;
+                        }
+                        for warning in self.warnings.new_of(&status) {
+                            self.progress.say(&format!("warning: {warning}"));
                         }
                         self.progress.update(&status);
                     }

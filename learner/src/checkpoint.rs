@@ -205,6 +205,15 @@ pub struct Loaded {
     pub damaged: Vec<CheckpointError>,
 }
 
+impl Loaded {
+    /// What somebody should know of: newer checkpoints that could not be used.
+    pub fn warnings(&self) -> Vec<String> {
+        let env_steps = self.state.manifest.progress.env_steps;
+        let words = |error| format!("a checkpoint is damaged, the one at {env_steps} steps is used: {error}");
+        self.damaged.iter().map(words).collect()
+    }
+}
+
 /// The newest checkpoint that is whole and of a run that this learner can go on from, with replay's last `buffer_size` episodes;
 /// `None` where none was ever written.
 ///

@@ -121,6 +121,8 @@ pub struct Coordinator {
     learner_waiting: Stopwatch,
     rates: RateWindow,
     checkpoints: v1::CheckpointsStatus,
+    /// Whether the last one was not written.
+    checkpoints_fail: bool,
     happenings: Happenings,
     /// How often the ledger was found not to balance.
     imbalances: u64,
@@ -138,8 +140,10 @@ impl Coordinator {
         work: mpsc::Sender<Work>,
         fences: mpsc::Sender<Fence>,
     ) -> Self {
-        let Beginning { batches, terms, standing } = beginning;
+        let Beginning { batches, terms, standing, warnings } = beginning;
         let started = Instant::now();
+        let mut happenings = Happenings::new(started);
+        warnings.into_iter().for_each(|what| happenings.warn(standing.progress.env_steps, what));
         Self {
             epsilon: config.epsilon(standing.progress.env_steps),
             standing,
@@ -154,7 +158,8 @@ impl Coordinator {
             learner_waiting: Stopwatch::default(),
             rates: RateWindow::default(),
             checkpoints: v1::CheckpointsStatus::default(),
-            happenings: Happenings::new(started),
+            checkpoints_fail: false,
+            happenings,
             imbalances: 0,
             started,
             config,
@@ -211,6 +216,11 @@ impl Coordinator {
 
     fn happened(&mut self, what: String) {
         self.happenings.note(self.standing.progress.env_steps, what);
+    }
+
+    /// What somebody should know of.
+    fn warned(&mut self, what: String) {
+        self.happenings.warn(self.standing.progress.env_steps, what);
     }
 
     fn handle(&mut self, event: Event) {
@@ -279,11 +289,17 @@ impl Coordinator {
         }
     }
 
-    fn checkpoint_ended(&mut self, CheckpointEnded { env_steps, duration, written }: CheckpointEnded) {
-        if !written {
+    fn checkpoint_ended(&mut self, CheckpointEnded { env_steps, duration, failed }: CheckpointEnded) {
+        if let Some(why) = failed {
             self.checkpoints.failed += 1;
-            self.happened(format!("the checkpoint at {env_steps} steps was not written"));
+            // Of many in a row the first is said aloud.
+            if !std::mem::replace(&mut self.checkpoints_fail, true) {
+                self.warned(format!("the checkpoint at {env_steps} steps was not written: {why}"));
+            }
             return;
+        }
+        if std::mem::take(&mut self.checkpoints_fail) {
+            self.warned("checkpoints are written again".into());
         }
         let checkpoints = &mut self.checkpoints;
         (checkpoints.written, checkpoints.env_steps) = (checkpoints.written + 1, env_steps);

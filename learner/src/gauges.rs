@@ -86,11 +86,21 @@ impl Happenings {
 
     /// Remembers what happened, after so many environment steps.
     pub fn note(&mut self, env_steps: u64, what: String) {
+        self.push(env_steps, what, false);
+    }
+
+    /// Remembers what somebody should know of: it stays when what is no warning is forgotten.
+    pub fn warn(&mut self, env_steps: u64, what: String) {
+        self.push(env_steps, what, true);
+    }
+
+    fn push(&mut self, env_steps: u64, what: String, warning: bool) {
         if self.last.len() == HAPPENINGS {
-            self.last.pop_front();
+            let oldest = self.last.iter().position(|happening| !happening.warning).unwrap_or(0);
+            self.last.remove(oldest);
         }
         let wall_s = self.began.elapsed().as_secs_f64();
-        self.last.push_back(v1::Happening { wall_s, env_steps, what });
+        self.last.push_back(v1::Happening { wall_s, env_steps, what, warning });
     }
 
     /// Oldest first.
@@ -144,5 +154,17 @@ mod tests {
         }
         let list = happenings.list();
         assert_eq!((list.len(), list[0].env_steps, list[19].what.as_str()), (20, 30, "step 49"));
+    }
+
+    #[test]
+    fn warnings_outlive_what_is_none() {
+        let mut happenings = Happenings::new(Instant::now());
+        happenings.warn(0, "the disk is full".into());
+        (0..50).for_each(|step| happenings.note(step, "an actor joined".into()));
+        let list = happenings.list();
+        assert_eq!((list.len(), list[0].what.as_str(), list[0].warning), (20, "the disk is full", true));
+        assert!(list[1..].iter().all(|happening| !happening.warning));
+        (0..30).for_each(|step| happenings.warn(step, format!("warning {step}")));
+        assert_eq!((happenings.list().len(), happenings.list()[0].what.as_str()), (20, "warning 10"));
     }
 }

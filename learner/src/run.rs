@@ -264,10 +264,9 @@ fn load(
     algorithm: &Algorithm,
 ) -> Result<Option<Loaded>, LearnerError> {
     let loaded = checkpoint::load_newest(run_dir, learner, expected, algorithm)?;
-    if let Some(Loaded { folder, state, damaged, .. }) = &loaded {
-        for error in damaged {
-            tracing::error!(%error, "a checkpoint is damaged; the one before is used");
-        }
+    if let Some(loaded) = &loaded {
+        loaded.warnings().iter().for_each(|warning| tracing::warn!("{warning}"));
+        let Loaded { folder, state, .. } = loaded;
         let (folder, env_steps) = (folder.display(), state.manifest.progress.env_steps);
         tracing::info!(%folder, env_steps, "going on from a checkpoint");
     }

@@ -141,6 +141,8 @@ pub struct Trainer {
     env_steps_before: u64,
     news: Box<dyn FnMut(News) + Send>,
     writer: mpsc::Sender<ToWrite>,
+    /// What somebody should know of how the run begins.
+    warnings: Vec<String>,
 }
 
 /// Where a run begins: what the rest of the learner needs to know of it.
@@ -152,6 +154,8 @@ pub struct Beginning {
     pub terms: Vec<Terms>,
     /// How training stands.
     pub standing: Standing,
+    /// What somebody should know of it.
+    pub warnings: Vec<String>,
 }
 
 impl Trainer {
@@ -187,6 +191,7 @@ impl Trainer {
             env_steps_before: 0,
             news,
             writer,
+            warnings: loaded.as_ref().map(Loaded::warnings).unwrap_or_default(),
             learner,
             run_dir,
             config,
@@ -209,6 +214,7 @@ impl Trainer {
             batches: self.standing.progress.episodes / self.config.algorithm.n_rollout_threads as u64,
             terms: self.terms.iter().copied().collect(),
             standing: self.standing.clone(),
+            warnings: self.warnings.clone(),
         }
     }
 

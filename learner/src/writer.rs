@@ -24,14 +24,14 @@ use tokio::sync::{mpsc as async_mpsc, oneshot};
 pub type Written = Result<PathBuf, CheckpointError>;
 
 /// What became of a checkpoint.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub struct CheckpointEnded {
     /// Environment steps collected by then.
     pub env_steps: u64,
     /// How long it took.
     pub duration: Duration,
-    /// Whether it is on disk.
-    pub written: bool,
+    /// Why it is not on disk, if it is not.
+    pub failed: Option<String>,
 }
 
 /// What the writer is given, in order.
@@ -82,7 +82,8 @@ impl Writer {
                         }
                         Err(error) => tracing::error!(%error, env_steps, "a checkpoint was not written"),
                     }
-                    let ended = CheckpointEnded { env_steps, duration, written: written.is_ok() };
+                    let failed = written.as_ref().err().map(ToString::to_string);
+                    let ended = CheckpointEnded { env_steps, duration, failed };
                     // At the end of a run nobody counts any more.
                     let _ = self.events.blocking_send(Event::CheckpointEnded(ended));
                     if let Some(answer) = answer {

@@ -101,7 +101,7 @@ impl Model {
         if !std::mem::replace(&mut self.away, true) {
             let (wall_s, env_steps) = (self.status.wall_s, self.status.env_steps);
             let what = "the learner has gone; waiting for it to come back".to_owned();
-            self.happened(Happening { wall_s, env_steps, what });
+            self.happened(Happening { wall_s, env_steps, what, warning: false });
         }
     }
 
@@ -133,7 +133,7 @@ mod tests {
 
     #[test]
     fn a_restarted_learner_repeats_nothing() {
-        let happening = |wall_s, what: &str| Happening { wall_s, env_steps: 0, what: what.into() };
+        let happening = |wall_s, what: &str| Happening { wall_s, what: what.into(), ..Happening::default() };
         let status = |pid, happenings| RunStatus { pid, happenings, ..RunStatus::default() };
         let mut model = Model::new("run".into());
         model.status(status(1, vec![happening(1.0, "a")]));

@@ -196,7 +196,11 @@ mod tests {
             rates: Some(Rates { env_steps_per_s: 2500.0, ..Rates::default() }),
             actors: vec![actor("actor-0", false, 3), actor("actor-1", true, 0)],
             ledger: Some(LedgerStatus { handed_out: 9, inserted: 5, outstanding: 4, ..Default::default() }),
-            happenings: vec![Happening { wall_s: 1.0, env_steps: 0, what: "actor-0 joined".into() }],
+            happenings: vec![Happening {
+                what: "actor-0 joined".into(),
+                wall_s: 1.0,
+                ..Happening::default()
+            }],
             ..RunStatus::default()
         });
         model

@@ -3,7 +3,7 @@
 import { Chart } from "./chart.js";
 import { EpisodeView } from "./episode.js";
 import { get, listen, post } from "./feed.js";
-import { followLog, showLedger, showProcesses, showTiles } from "./panels.js";
+import { followLog, showLedger, showProcesses, showTiles, showWarnings } from "./panels.js";
 import { byId, duration, grouped, make, short } from "./text.js";
 
 /** Small charts: key in a training line, and what it is called. */
@@ -85,6 +85,7 @@ function showStatus() {
     `${grouped(status.env_steps)} of ${grouped(status.env_steps_max)} steps, ${Math.floor(share * 100)} %`;
   const left = (status.env_steps_max - status.env_steps) / speed?.env_steps_per_s;
   byId("progress-left").textContent = speed?.env_steps_per_s > 0.5 ? `${duration(left)} left` : "";
+  showWarnings(status);
   showTiles(status, speed);
   showProcesses(status);
   showLedger(status.ledger);

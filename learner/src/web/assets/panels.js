@@ -24,6 +24,15 @@ export function showTiles(status, rates) {
   );
 }
 
+/** What the learner says aloud, the newest first. */
+export function showWarnings({ happenings }) {
+  const warnings = happenings.filter(({ warning }) => warning).reverse();
+  byId("warnings").hidden = warnings.length === 0;
+  byId("warnings").replaceChildren(
+    ...warnings.map(({ env_steps, what }) => make("li", {}, make("b", {}, `${grouped(env_steps)} steps`), ` ${what}`)),
+  );
+}
+
 function actorState({ hung, silent_s, outstanding }, paused) {
   if (hung) return ["hung", "bad"];
   if (silent_s > SILENT_S) return ["silent", "warn"];
