@@ -29,6 +29,39 @@ vectorized! {
     }
 }
 
+/// LeakyReLU's slope below 0, PyTorch's.
+const LEAK: f32 = 0.01;
+
+vectorized! {
+    /// y = LeakyReLU(y): y where it is positive, else 0.01 y; in place.
+    pub fn leaky_relu<'a>(y: ViewMut<'a>) {
+        for row in 0..y.rows {
+            for value in y.row(row) {
+                *value = if *value > 0.0 { *value } else { LEAK * *value };
+            }
+        }
+    }
+}
+
+vectorized! {
+    /// dy = dy where y > 0, else 0.01 dy, in place; `y` is what [`leaky_relu`] left.
+    pub fn leaky_relu_backward<'a>(y: View<'a>, dy: ViewMut<'a>) {
+        debug_assert_eq!((y.rows, y.cols), (dy.rows, dy.cols));
+        for row in 0..y.rows {
+            for (dy, y) in dy.row(row).iter_mut().zip(y.row(row)) {
+                *dy = if *y > 0.0 { *dy } else { LEAK * *dy };
+            }
+        }
+    }
+}
+
+/// softplus(x) = ln(1 + e^x), and its slope 1 / (1 + e^−x): exact however large x is. For single numbers, such as a
+/// loss.
+pub fn softplus(x: f64) -> (f64, f64) {
+    let small = libm::exp(-x.abs());
+    (x.max(0.0) + libm::log1p(small), if x > 0.0 { 1.0 / (1.0 + small) } else { small / (1.0 + small) })
+}
+
 /// ELU(x) = x where x > 0, else e^x − 1.
 #[inline(always)]
 pub fn elu(x: f32) -> f32 {
@@ -95,6 +128,30 @@ mod tests {
         let mut dy = [1.0; 6];
         relu_backward(View::dense(&y, 3), ViewMut::dense(&mut dy, 3));
         assert_eq!(dy, [0.0, 0.0, 1.0, 0.0, 1.0, 1.0]);
+    }
+
+    #[test]
+    fn leaky_relu_and_its_slope() {
+        let mut y = [-1.0, 0.0, 2.0, -300.0];
+        leaky_relu(ViewMut::dense(&mut y, 2));
+        assert_eq!(y, [-0.01, 0.0, 2.0, -3.0]);
+        let mut dy = [1.0, 1.0, 5.0, 2.0];
+        leaky_relu_backward(View::dense(&y, 2), ViewMut::dense(&mut dy, 2));
+        assert_eq!(dy, [0.01, 0.01, 5.0, 0.02]);
+    }
+
+    #[test]
+    fn softplus_and_its_slope() {
+        for (x, value, slope) in [
+            (0.0, std::f64::consts::LN_2, 0.5),
+            (1.0, 1.313_261_687_518_222_8, 0.731_058_578_630_004_9),
+            (-1.0, 0.313_261_687_518_222_8, 0.268_941_421_369_995_1),
+            (2000.0, 2000.0, 1.0),
+            (-2000.0, 0.0, 0.0),
+        ] {
+            let (v, s) = softplus(x);
+            assert!((v - value).abs() < 1e-15 && (s - slope).abs() < 1e-15, "{x}: {v} {s}");
+        }
     }
 
     #[test]

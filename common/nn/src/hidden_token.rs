@@ -44,7 +44,7 @@ pub struct Places<'a> {
 
 /// What forward leaves for backward. With R agent rows and E entity rows; what has 2R rows begins with those of
 /// hidden tokens.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct HiddenTokenState {
     /// Who asks: hidden tokens before, and agents' own x, `[2R, h]`.
     u: Buffer,
@@ -61,8 +61,6 @@ pub struct HiddenTokenState {
     /// `[2R, a]`.
     attended: Buffer,
     post_norm: PostNormState,
-    /// The block's output, `[2R, h]`: hidden tokens after each step, and agents' own rows.
-    out: Buffer,
 }
 
 impl HiddenToken {
@@ -86,52 +84,59 @@ impl HiddenToken {
         self.post_norm.dim()
     }
 
-    /// From the entities' `x` (E, h) to the state's output. `before` (rows of the first time, h) are the hidden tokens
-    /// before the first time, or zeros.
+    /// Writes what becomes of the agents' own tokens, `own` [R, h], and their hidden tokens after each step, `history`
+    /// [R, h], from the entities' `x` (E, h). `before` (rows of the first time, h) are the hidden tokens before the first
+    /// time, or zeros. The state's buffers come from `stock`.
+    #[allow(clippy::too_many_arguments, reason = "a matrix and its companions, each named")]
     pub fn forward(
         &self,
         params: &[f32],
         places: Places<'_>,
         x: View<'_>,
         before: Option<View<'_>>,
-        state: &mut HiddenTokenState,
-    ) {
+        own: &mut [f32],
+        history: &mut [f32],
+        stock: &mut Scratch,
+    ) -> HiddenTokenState {
         let (h, a) = (self.dim(), self.attention.dim);
         let rows = places.rows();
-        self.project_entities(params, places, x, state);
-        state.hidden.fit(rows * 2 * a);
-        state.hidden_weights.fit(self.weights(places.groups));
-        state.own_weights.fit(self.weights(places.groups));
-        state.attended.fit(2 * rows * a);
-        state.out.fit(2 * rows * h);
-        self.post_norm.fit(2 * rows, &mut state.post_norm);
+        let mut state = HiddenTokenState {
+            u: stock.take(2 * rows * h),
+            queries: stock.take(2 * rows * a),
+            entities: stock.take(x.rows * 2 * a),
+            hidden: stock.take(rows * 2 * a),
+            hidden_weights: stock.take(self.weights(places.groups)),
+            own_weights: stock.take(self.weights(places.groups)),
+            attended: stock.take(2 * rows * a),
+            post_norm: self.post_norm.state(2 * rows, stock),
+        };
+        self.project_entities(params, places, x, &mut state);
         let (mut pairs, mut weights) = (0, 0);
         for time in 0..places.times() {
             let (groups, range) = places.at(time);
-            let previous = if time == 0 { before } else { None };
-            previous_tokens(places, time, previous, state, h);
-            self.project_hidden(params, range.clone(), state);
+            let (done, ahead) = history.split_at_mut(range.start * h);
+            let previous = match before {
+                _ if time > 0 => Some(View::dense(&done[places.agent_times[time - 1] * h..], h)),
+                before => before,
+            };
+            self.project_hidden(params, range.clone(), previous, &mut state);
             let part = weights..weights + self.weights(groups);
-            let HiddenTokenState { queries, entities, hidden, hidden_weights, attended, .. } = state;
+            let HiddenTokenState { queries, entities, hidden, hidden_weights, attended, .. } = &mut state;
             let tokens = Tokens { queries: View::dense(&queries[..rows * a], a), entities, hidden };
             let out = ViewMut::dense(&mut attended[..rows * a], a);
-            attend(
-                tokens,
-                groups,
-                places.visible_from(pairs),
-                &mut hidden_weights[part.clone()],
-                out,
-                self.head_dim(),
-            );
+            let weights_here = &mut hidden_weights[part.clone()];
+            attend(tokens, groups, places.visible_from(pairs), weights_here, out, self.head_dim());
             weights = part.end;
             pairs += groups.iter().map(Group::pairs).sum::<usize>();
-            self.finish(params, range, state);
+            let out = ViewMut::dense(&mut ahead[..range.len() * h], h);
+            self.finish(params, range, &mut state, out);
         }
-        let HiddenTokenState { queries, entities, hidden, own_weights, attended, .. } = state;
+        let HiddenTokenState { queries, entities, hidden, own_weights, attended, .. } = &mut state;
         let tokens = Tokens { queries: View::dense(&queries[rows * a..], a), entities, hidden };
         let out = ViewMut::dense(&mut attended[rows * a..], a);
         attend(tokens, places.groups, places.visible, own_weights, out, self.head_dim());
-        self.finish(params, rows..2 * rows, state);
+        self.finish(params, rows..2 * rows, &mut state, ViewMut::dense(own, h));
+        state
     }
 
     /// Takes `d_own` (R, h), the gradient by the agents' own rows. Writes `d_x` (E, h) and adds to the parameters'
@@ -142,7 +147,7 @@ impl HiddenToken {
         params: &[f32],
         places: Places<'_>,
         x: View<'_>,
-        state: &mut HiddenTokenState,
+        state: &HiddenTokenState,
         d_own: View<'_>,
         mut d_x: ViewMut<'_>,
         grads: &mut [f32],
@@ -165,7 +170,7 @@ impl HiddenToken {
             post_norm,
             ..
         } = state;
-        self.post_norm.fit_backward(post_norm);
+        let mut d_post_norm = self.post_norm.gradients(post_norm, scratch);
 
         // The agents' own rows of all times.
         let (d_u_hidden, d_u_own) = d_u.split_at_mut(rows * h);
@@ -175,6 +180,7 @@ impl HiddenToken {
             params,
             rows..2 * rows,
             post_norm,
+            &mut d_post_norm,
             d_own,
             ViewMut::dense(d_u_own, h),
             ViewMut::dense(d_attended_own, a),
@@ -203,6 +209,7 @@ impl HiddenToken {
                 params,
                 range.clone(),
                 post_norm,
+                &mut d_post_norm,
                 View::dense(&d_out, h).rows(range.clone()),
                 ViewMut::dense(d_u_hidden, h).rows(range.clone()),
                 ViewMut::dense(d_attended_hidden, a).rows(range.clone()),
@@ -232,7 +239,8 @@ impl HiddenToken {
         }
         scratch.give(d_out);
 
-        self.post_norm.backward_params(View::dense(attended, a), post_norm, grads);
+        self.post_norm.backward_params(View::dense(attended, a), post_norm, &d_post_norm, grads);
+        d_post_norm.give(scratch);
         let (u, d_queries_all) = (View::dense(u, h), View::dense(&d_queries, a));
         self.attention.query.backward_params(u, d_queries_all, grads);
         let values = View::dense(entities, 2 * a).columns(a..2 * a);
@@ -270,21 +278,34 @@ impl HiddenToken {
         state: &mut HiddenTokenState,
     ) {
         let (h, a, rows) = (self.dim(), self.attention.dim, places.rows());
-        let u = state.u.fit(2 * rows * h);
+        let u = &mut state.u;
         for group in places.groups {
             for (agent, entity) in group.queries.clone().zip(group.keys.clone()) {
                 u[(rows + agent) * h..][..h].copy_from_slice(x.row(entity));
             }
         }
-        let queries = ViewMut::dense(state.queries.fit(2 * rows * a), a).rows(rows..2 * rows);
+        let queries = ViewMut::dense(&mut state.queries[rows * a..], a);
         self.attention.query.forward(params, View::dense(&u[rows * h..], h), queries);
-        self.keys_and_values(params, x, ViewMut::dense(state.entities.fit(x.rows * 2 * a), 2 * a));
+        self.keys_and_values(params, x, ViewMut::dense(&mut state.entities, 2 * a));
     }
 
-    /// Queries, keys and values of these rows' hidden tokens.
-    fn project_hidden(&self, params: &[f32], rows: Range<usize>, state: &mut HiddenTokenState) {
+    /// These rows' hidden tokens, zeros or the first of `previous`, and their queries, keys and values.
+    fn project_hidden(
+        &self,
+        params: &[f32],
+        rows: Range<usize>,
+        previous: Option<View<'_>>,
+        state: &mut HiddenTokenState,
+    ) {
         let (h, a) = (self.dim(), self.attention.dim);
-        let u = View::dense(&state.u, h).rows(rows.clone());
+        let u = &mut state.u[rows.start * h..rows.end * h];
+        match previous {
+            Some(previous) => {
+                (u.chunks_exact_mut(h).enumerate()).for_each(|(row, u)| u.copy_from_slice(previous.row(row)))
+            }
+            None => u.fill(0.0),
+        }
+        let u = View::dense(u, h);
         self.attention.query.forward(params, u, ViewMut::dense(&mut state.queries, a).rows(rows.clone()));
         self.keys_and_values(params, u, ViewMut::dense(&mut state.hidden, 2 * a).rows(rows));
     }
@@ -297,10 +318,11 @@ impl HiddenToken {
     }
 
     /// All behind the attention, of these of the 2R rows.
-    fn finish(&self, params: &[f32], rows: Range<usize>, state: &mut HiddenTokenState) {
-        let HiddenTokenState { u, attended, post_norm, out, .. } = state;
+    fn finish(&self, params: &[f32], rows: Range<usize>, state: &mut HiddenTokenState, out: ViewMut<'_>) {
+        let HiddenTokenState { u, attended, post_norm, .. } = state;
         let (u, attended) = (View::dense(u, self.dim()), View::dense(attended, self.attention.dim));
-        self.post_norm.forward(params, rows, u, attended, post_norm, ViewMut::dense(out, self.dim()));
+        let (u, attended) = (u.rows(rows.clone()), attended.rows(rows.clone()));
+        self.post_norm.forward(params, rows, u, attended, post_norm, out);
     }
 
     /// Softmax weights of these groups.
@@ -315,14 +337,13 @@ impl HiddenToken {
 }
 
 impl HiddenTokenState {
-    /// Hidden tokens after each step, `[R, h]`.
-    pub fn history(&self) -> &[f32] {
-        &self.out[..self.out.len() / 2]
-    }
-
-    /// What became of the agents' own tokens, `[R, h]`.
-    pub fn own(&self) -> &[f32] {
-        &self.out[self.out.len() / 2..]
+    /// Gives all buffers back.
+    pub fn give(self, stock: &mut Scratch) {
+        let Self { u, queries, entities, hidden, hidden_weights, own_weights, attended, post_norm } = self;
+        for buffer in [u, queries, entities, hidden, hidden_weights, own_weights, attended] {
+            stock.give(buffer);
+        }
+        post_norm.give(stock);
     }
 }
 
@@ -347,27 +368,6 @@ impl<'a> Places<'a> {
             Visible::All => Visible::All,
             Visible::Where(flags) => Visible::Where(&flags[pairs..]),
         }
-    }
-}
-
-/// Fills a time's rows of u with the hidden tokens of the time before.
-fn previous_tokens(
-    places: Places<'_>,
-    time: usize,
-    before: Option<View<'_>>,
-    state: &mut HiddenTokenState,
-    h: usize,
-) {
-    let (_, range) = places.at(time);
-    let to = &mut state.u[range.start * h..range.end * h];
-    if time > 0 {
-        to.copy_from_slice(&state.out[places.agent_times[time - 1] * h..][..range.len() * h]);
-    } else if let Some(before) = before {
-        for (row, to) in to.chunks_exact_mut(h).enumerate() {
-            to.copy_from_slice(before.row(row));
-        }
-    } else {
-        to.fill(0.0);
     }
 }
 

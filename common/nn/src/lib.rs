@@ -11,6 +11,8 @@
 pub mod activation;
 pub mod attention;
 pub mod categorical;
+pub mod gaussian;
+pub mod generated;
 pub mod gradcheck;
 pub mod gru;
 pub mod hidden_token;
@@ -26,6 +28,7 @@ pub mod tape;
 mod view;
 
 pub use attention::Attention;
+pub use generated::Generated;
 pub use gru::Gru;
 pub use hidden_token::HiddenToken;
 pub use layer_norm::LayerNorm;

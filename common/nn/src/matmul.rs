@@ -44,10 +44,19 @@ fn count(m: usize, k: usize, n: usize) {
 pub fn x_wt(x: View<'_>, w: View<'_>, y: ViewMut<'_>, accum: Accum) {
     debug_assert_eq!((x.cols, x.rows, y.cols), (w.cols, y.rows, w.rows));
     if x.rows == 1 {
-        return single_row(x, w, y, accum);
+        return single_row(x, y, accum, |x, y| x_wt(x, w, y, accum));
     }
     count(x.rows, x.cols, w.rows);
     matmul(write(y), accum.into(), read(x), read(w).transpose(), 1.0_f32, Par::Seq);
+}
+
+/// `y = x w`, or `y += x w`: the forward of a layer whose weight stands the other way, `w` (in, out). `x` (rows, in),
+/// `y` (rows, out).
+pub fn x_w(x: View<'_>, w: View<'_>, y: ViewMut<'_>, accum: Accum) {
+    if x.rows == 1 {
+        return single_row(x, y, accum, |x, y| x_w(x, w, y, accum));
+    }
+    dy_w(x, w, y, accum);
 }
 
 /// `dx = dy w`, or `dx += dy w`: a layer's backward to its input. `dy` (rows, out), `dx` (rows, in).
@@ -67,19 +76,14 @@ pub fn dyt_x(dy: View<'_>, x: View<'_>, dw: ViewMut<'_>, accum: Accum) {
 
 /// One row goes through faer's matrix–vector path, which sums in another order. A second row of zeros keeps
 /// it on the path that all other row counts take.
-fn single_row(x: View<'_>, w: View<'_>, mut y: ViewMut<'_>, accum: Accum) {
+fn single_row(x: View<'_>, mut y: ViewMut<'_>, accum: Accum, product: impl FnOnce(View<'_>, ViewMut<'_>)) {
     let mut two = vec![0.0; 2 * x.cols];
     two[..x.cols].copy_from_slice(x.row(0));
     let mut out = vec![0.0; 2 * y.cols];
     if accum == Accum::Add {
         out[..y.cols].copy_from_slice(y.row(0));
     }
-    x_wt(
-        View::dense(&two, x.cols),
-        w,
-        ViewMut { data: &mut out, rows: 2, cols: y.cols, stride: y.cols },
-        accum,
-    );
+    product(View::dense(&two, x.cols), ViewMut::dense(&mut out, y.cols));
     let cols = y.cols;
     y.row(0).copy_from_slice(&out[..cols]);
 }
@@ -179,22 +183,28 @@ mod tests {
                 let width = inputs + margin;
                 let (x, w) = (noise(1, 300 * width), noise(2, outputs * width));
                 let start = noise(3, 300 * outputs);
+                let across = noise(4, inputs * (outputs + margin));
+                // One behind the other: with the weight as (out, in) and as (in, out).
                 let run = |first: usize, rows: usize| {
                     let mut y = start[first * outputs..(first + rows) * outputs].to_vec();
-                    let x = View::dense(&x[first * width..(first + rows) * width], width);
+                    let mut y_across = y.clone();
+                    let x = View::dense(&x[first * width..(first + rows) * width], width).columns(0..inputs);
                     let w = View::dense(&w, width).columns(margin..width);
-                    x_wt(x.columns(0..inputs), w, ViewMut::dense(&mut y, outputs), accum);
-                    y
+                    x_wt(x, w, ViewMut::dense(&mut y, outputs), accum);
+                    let w = View::dense(&across, outputs + margin).columns(margin..outputs + margin);
+                    x_w(x, w, ViewMut::dense(&mut y_across, outputs), accum);
+                    [y, y_across]
                 };
                 let all = run(0, 300);
                 for (first, rows) in
                     (1..64).map(|rows| (rows % 7, rows)).chain([(3, 97), (0, 128), (50, 250)])
                 {
-                    let part = run(first, rows);
-                    assert!(
-                        part == all[first * outputs..(first + rows) * outputs],
-                        "{inputs} {outputs} {rows} {margin}"
-                    );
+                    for (part, all) in run(first, rows).iter().zip(&all) {
+                        assert!(
+                            part[..] == all[first * outputs..(first + rows) * outputs],
+                            "{inputs} {outputs} {rows} {margin}"
+                        );
+                    }
                 }
             }
         }

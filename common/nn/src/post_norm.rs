@@ -2,7 +2,7 @@
 
 use crate::Accum;
 use crate::{
-    Buffer, LayerNorm, LayoutBuilder, Linear, View, ViewMut, activation, linear, matmul, vectorized,
+    Buffer, LayerNorm, LayoutBuilder, Linear, Scratch, View, ViewMut, activation, linear, matmul, vectorized,
 };
 use std::ops::Range;
 
@@ -20,10 +20,10 @@ pub struct PostNorm {
     feedforward_norm: LayerNorm,
 }
 
-/// What forward leaves for backward, and backward for [`PostNorm::backward_params`]. With N rows:
-#[derive(Debug, Default)]
+/// What forward leaves for backward. With N rows:
+#[derive(Debug)]
 pub struct PostNormState {
-    /// u + `attention_out`(a), `[N, h]`; backward leaves its gradient in `d_attention_sum`.
+    /// u + `attention_out`(a), `[N, h]`.
     attention_sum: Buffer,
     /// Moments of that, `[N, 2]`.
     attention_moments: Buffer,
@@ -35,9 +35,14 @@ pub struct PostNormState {
     feedforward_sum: Buffer,
     /// Moments of that, `[N, 2]`.
     feedforward_moments: Buffer,
-    d_attention_sum: Buffer,
-    d_hidden: Buffer,
-    d_feedforward_sum: Buffer,
+}
+
+/// Gradients by parts of [`PostNormState`], which the parameters' gradients are made of in the end.
+#[derive(Debug)]
+pub struct PostNormGradients {
+    attention_sum: Buffer,
+    hidden: Buffer,
+    feedforward_sum: Buffer,
 }
 
 impl PostNorm {
@@ -69,18 +74,20 @@ impl PostNorm {
         self.attention_out.outputs
     }
 
-    /// Makes the state hold so many rows, none of them written yet.
-    pub fn fit(&self, rows: usize, state: &mut PostNormState) {
+    /// A state for so many rows, none of them written yet.
+    pub fn state(&self, rows: usize, stock: &mut Scratch) -> PostNormState {
         let (h, f) = (self.dim(), self.feedforward_hidden.outputs);
-        for buffer in [&mut state.attention_sum, &mut state.y, &mut state.feedforward_sum] {
-            buffer.fit(rows * h);
+        PostNormState {
+            attention_sum: stock.take(rows * h),
+            attention_moments: stock.take(rows * 2),
+            y: stock.take(rows * h),
+            hidden: stock.take(rows * f),
+            feedforward_sum: stock.take(rows * h),
+            feedforward_moments: stock.take(rows * 2),
         }
-        state.hidden.fit(rows * f);
-        state.attention_moments.fit(rows * 2);
-        state.feedforward_moments.fit(rows * 2);
     }
 
-    /// Rows `rows` of the state and of `out` (N, h), from the same rows of `u` (N, h) and `attended` (N, a).
+    /// Writes `out` (rows, h) and rows `rows` of the state, from `u` (rows, h) and `attended` (rows, a).
     pub fn forward(
         &self,
         params: &[f32],
@@ -91,7 +98,6 @@ impl PostNorm {
         out: ViewMut<'_>,
     ) {
         let (h, f) = (self.dim(), self.feedforward_hidden.outputs);
-        let (u, attended) = (u.rows(rows.clone()), attended.rows(rows.clone()));
         let mut sum = of_rows(&mut state.attention_sum, &rows, h);
         matmul::x_wt(attended, self.attention_out.weight(params), sum.reborrow(), Accum::Replace);
         add_row_and(sum.reborrow(), self.attention_out.bias(params), u);
@@ -106,26 +112,27 @@ impl PostNorm {
         matmul::x_wt(hidden.as_view(), weight, sum.reborrow(), Accum::Replace);
         add_row_and(sum.reborrow(), self.feedforward_out.bias(params), y.as_view());
         let moments = &mut state.feedforward_moments[2 * rows.start..2 * rows.end];
-        self.feedforward_norm.forward(params, sum.as_view(), out.rows(rows), moments);
+        self.feedforward_norm.forward(params, sum.as_view(), out, moments);
     }
 
-    /// Makes the state hold the gradients of as many rows as forward has written. Rows that [`PostNorm::backward`]
-    /// does not come to count as zeros.
-    pub fn fit_backward(&self, state: &mut PostNormState) {
-        let PostNormState { d_attention_sum, d_hidden, d_feedforward_sum, y, hidden, .. } = state;
-        d_attention_sum.fit(y.len()).fill(0.0);
-        d_feedforward_sum.fit(y.len()).fill(0.0);
-        d_hidden.fit(hidden.len()).fill(0.0);
+    /// Room for the gradients of as many rows as forward has written.
+    pub fn gradients(&self, state: &PostNormState, stock: &mut Scratch) -> PostNormGradients {
+        PostNormGradients {
+            attention_sum: stock.take(state.y.len()),
+            hidden: stock.take(state.hidden.len()),
+            feedforward_sum: stock.take(state.y.len()),
+        }
     }
 
-    /// Takes `d_out` (rows, h): the gradient by rows `rows` of the output. Writes the same rows' `d_u` (rows, h) and
-    /// `d_attended` (rows, a), and adds to the gradients of the norms' parameters.
+    /// Takes `d_out` (rows, h): the gradient by what forward made of rows `rows`. Writes `d_u` (rows, h), `d_attended`
+    /// (rows, a) and the same rows of `d`, and adds to the gradients of the norms' parameters.
     #[allow(clippy::too_many_arguments, reason = "a matrix and its companions, each named")]
     pub fn backward(
         &self,
         params: &[f32],
         rows: Range<usize>,
-        state: &mut PostNormState,
+        state: &PostNormState,
+        d: &mut PostNormGradients,
         d_out: View<'_>,
         mut d_u: ViewMut<'_>,
         d_attended: ViewMut<'_>,
@@ -134,10 +141,10 @@ impl PostNorm {
         let (h, f) = (self.dim(), self.feedforward_hidden.outputs);
         let sum = View::dense(&state.feedforward_sum, h).rows(rows.clone());
         let moments = &state.feedforward_moments[2 * rows.start..2 * rows.end];
-        let mut d_sum = of_rows(&mut state.d_feedforward_sum, &rows, h);
+        let mut d_sum = of_rows(&mut d.feedforward_sum, &rows, h);
         self.feedforward_norm.backward(params, sum, moments, d_out, Some(d_sum.reborrow()), grads);
         let d_sum = d_sum.as_view();
-        let mut d_hidden = of_rows(&mut state.d_hidden, &rows, f);
+        let mut d_hidden = of_rows(&mut d.hidden, &rows, f);
         matmul::dy_w(d_sum, self.feedforward_out.weight(params), d_hidden.reborrow(), Accum::Replace);
         let hidden = View::dense(&state.hidden, f).rows(rows.clone());
         activation::relu_backward(hidden, d_hidden.reborrow());
@@ -148,7 +155,7 @@ impl PostNorm {
 
         let sum = View::dense(&state.attention_sum, h).rows(rows.clone());
         let moments = &state.attention_moments[2 * rows.start..2 * rows.end];
-        let mut d_sum = of_rows(&mut state.d_attention_sum, &rows, h);
+        let mut d_sum = of_rows(&mut d.attention_sum, &rows, h);
         self.attention_norm.backward(params, sum, moments, d_u.as_view(), Some(d_sum.reborrow()), grads);
         let d_sum = d_sum.as_view();
         matmul::dy_w(d_sum, self.attention_out.weight(params), d_attended, Accum::Replace);
@@ -157,15 +164,40 @@ impl PostNorm {
         }
     }
 
-    /// Adds to the gradients of the linear layers what all rows of [`PostNorm::backward`] make of them. `attended`
-    /// (N, a) is what forward read.
-    pub fn backward_params(&self, attended: View<'_>, state: &PostNormState, grads: &mut [f32]) {
+    /// Adds to the gradients of the linear layers, all rows together, after [`PostNorm::backward`] of all of them.
+    /// `attended` (N, a) is what forward read.
+    pub fn backward_params(
+        &self,
+        attended: View<'_>,
+        state: &PostNormState,
+        d: &PostNormGradients,
+        grads: &mut [f32],
+    ) {
         let (h, f) = (self.dim(), self.feedforward_hidden.outputs);
-        let d_sum = View::dense(&state.d_feedforward_sum, h);
+        let d_sum = View::dense(&d.feedforward_sum, h);
         self.feedforward_out.backward_params(View::dense(&state.hidden, f), d_sum, grads);
-        let (y, d_hidden) = (View::dense(&state.y, h), View::dense(&state.d_hidden, f));
+        let (y, d_hidden) = (View::dense(&state.y, h), View::dense(&d.hidden, f));
         self.feedforward_hidden.backward_params(y, d_hidden, grads);
-        self.attention_out.backward_params(attended, View::dense(&state.d_attention_sum, h), grads);
+        self.attention_out.backward_params(attended, View::dense(&d.attention_sum, h), grads);
+    }
+}
+
+impl PostNormState {
+    /// Gives all buffers back.
+    pub fn give(self, stock: &mut Scratch) {
+        let Self { attention_sum, attention_moments, y, hidden, feedforward_sum, feedforward_moments } = self;
+        for buffer in [attention_sum, attention_moments, y, hidden, feedforward_sum, feedforward_moments] {
+            stock.give(buffer);
+        }
+    }
+}
+
+impl PostNormGradients {
+    /// Gives all buffers back.
+    pub fn give(self, stock: &mut Scratch) {
+        for buffer in [self.attention_sum, self.hidden, self.feedforward_sum] {
+            stock.give(buffer);
+        }
     }
 }
 
@@ -205,11 +237,12 @@ mod tests {
     const PARTS: [Range<usize>; 2] = [0..2, 2..ROWS];
 
     fn run(block: &PostNorm, params: &[f32], u: &[f32], attended: &[f32]) -> (Vec<f32>, PostNormState) {
-        let (mut out, mut state) = (vec![0.0; ROWS * H], PostNormState::default());
-        block.fit(ROWS, &mut state);
+        let (mut out, mut state) = (vec![0.0; ROWS * H], block.state(ROWS, &mut Scratch::default()));
         for rows in PARTS {
             let (u, attended) = (View::dense(u, H), View::dense(attended, A));
-            block.forward(params, rows, u, attended, &mut state, ViewMut::dense(&mut out, H));
+            let (u, attended) = (u.rows(rows.clone()), attended.rows(rows.clone()));
+            let out = ViewMut::dense(&mut out, H).rows(rows.clone());
+            block.forward(params, rows, u, attended, &mut state, out);
         }
         (out, state)
     }
@@ -260,17 +293,17 @@ mod tests {
             let (out, _) = run(&block, params, u, attended);
             out.iter().zip(&to).map(|(out, to)| f64::from(out * to)).sum()
         };
-        let (_, mut state) = run(&block, &params, &u, &attended);
+        let (_, state) = run(&block, &params, &u, &attended);
         let (mut du, mut da) = (vec![9.0; u.len()], vec![9.0; attended.len()]);
         let mut grads = vec![0.0; len];
-        block.fit_backward(&mut state);
+        let mut d = block.gradients(&state, &mut Scratch::default());
         for rows in PARTS {
             let d_out = View::dense(&to, H).rows(rows.clone());
             let d_u = ViewMut::dense(&mut du, H).rows(rows.clone());
             let d_attended = ViewMut::dense(&mut da, A).rows(rows.clone());
-            block.backward(&params, rows, &mut state, d_out, d_u, d_attended, &mut grads);
+            block.backward(&params, rows, &state, &mut d, d_out, d_u, d_attended, &mut grads);
         }
-        block.backward_params(View::dense(&attended, A), &state, &mut grads);
+        block.backward_params(View::dense(&attended, A), &state, &d, &mut grads);
         check("params", &params, &grads, |params| loss(params, &u, &attended));
         check("u", &u, &du, |u| loss(&params, u, &attended));
         check("attended", &attended, &da, |attended| loss(&params, &u, attended));

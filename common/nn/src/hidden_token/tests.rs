@@ -31,10 +31,28 @@ fn places<'a>(groups: &'a [Group], visible: Visible<'a>) -> Places<'a> {
     Places { groups, group_times: &GROUP_TIMES, agent_times: &AGENT_TIMES, visible }
 }
 
-fn run(block: &HiddenToken, params: &[f32], x: &[f32], visible: Visible<'_>) -> HiddenTokenState {
-    let mut state = HiddenTokenState::default();
-    block.forward(params, places(&groups(), visible), View::dense(x, H), None, &mut state);
-    state
+/// What a pass says, and what it leaves.
+struct Run {
+    own: Vec<f32>,
+    history: Vec<f32>,
+    state: HiddenTokenState,
+}
+
+fn pass(
+    block: &HiddenToken,
+    params: &[f32],
+    places: Places<'_>,
+    x: View<'_>,
+    before: Option<View<'_>>,
+) -> Run {
+    let (mut own, mut history) = (vec![9.0; places.rows() * H], vec![9.0; places.rows() * H]);
+    let stock = &mut Scratch::default();
+    let state = block.forward(params, places, x, before, &mut own, &mut history, stock);
+    Run { own, history, state }
+}
+
+fn run(block: &HiddenToken, params: &[f32], x: &[f32], visible: Visible<'_>) -> Run {
+    pass(block, params, places(&groups(), visible), View::dense(x, H), None)
 }
 
 /// One agent, one token after another: what its own token and its hidden token become.
@@ -60,8 +78,8 @@ fn reference(block: &HiddenToken, params: &[f32], own: &[f32], tokens: &[&[f32]]
                 asked.iter().map(|kv| weight(kv) * kv[A + column].max(0.0)).sum::<f32>() / total
             })
             .collect();
-        let (mut out, mut state) = (vec![0.0; H], PostNormState::default());
-        block.post_norm.fit(1, &mut state);
+        let mut state = block.post_norm.state(1, &mut Scratch::default());
+        let mut out = vec![0.0; H];
         let (u, attended) = (View::dense(u, H), View::dense(&attended, A));
         block.post_norm.forward(params, 0..1, u, attended, &mut state, ViewMut::dense(&mut out, H));
         out
@@ -73,7 +91,7 @@ fn is_a_transformer_over_what_is_seen_and_the_hidden_token() {
     for heads in [1, 2] {
         let (block, len) = block(heads);
         let (params, x) = (noise(1, len), noise(2, ENTITIES * H));
-        let state = run(&block, &params, &x, Visible::Where(&SEEN));
+        let said = run(&block, &params, &x, Visible::Where(&SEEN));
         let token = |entity: usize| &x[entity * H..][..H];
         let none = vec![0.0; H];
         // Agent rows with their own token, what they see, and the row one time before.
@@ -90,7 +108,7 @@ fn is_a_transformer_over_what_is_seen_and_the_hidden_token() {
             let mut tokens: Vec<&[f32]> = seen.iter().map(|&entity| token(entity)).collect();
             tokens.push(&hidden);
             let [of_own, of_hidden] = reference(&block, &params, token(own), &tokens);
-            for (ours, theirs) in [(state.own(), &of_own), (state.history(), &of_hidden)] {
+            for (ours, theirs) in [(&said.own, &of_own), (&said.history, &of_hidden)] {
                 for (a, b) in ours[row * H..][..H].iter().zip(theirs) {
                     assert!((a - b).abs() < 1e-5, "{heads} heads, row {row}: {a} {b}");
                 }
@@ -116,12 +134,10 @@ fn one_time_at_a_time_is_the_same_to_the_bit() {
             visible: Visible::Where(&SEEN[seen]),
         };
         let before_view = before.as_ref().map(|before| View::dense(before, H).rows(0..rows.len()));
-        let mut state = HiddenTokenState::default();
-        let x = View::dense(&x, H).rows(entities);
-        block.forward(&params, places, x, before_view, &mut state);
-        assert_eq!(state.own(), &all.own()[rows.start * H..rows.end * H]);
-        assert_eq!(state.history(), &all.history()[rows.start * H..rows.end * H]);
-        before = Some(state.history().to_vec());
+        let said = pass(&block, &params, places, View::dense(&x, H).rows(entities), before_view);
+        assert_eq!(said.own, all.own[rows.start * H..rows.end * H]);
+        assert_eq!(said.history, all.history[rows.start * H..rows.end * H]);
+        before = Some(said.history);
     }
 }
 
@@ -131,16 +147,16 @@ fn gradients_are_the_numeric_ones() {
         let (block, len) = block(heads);
         let (params, x, to) = (noise(1, len), noise(2, ENTITIES * H), noise(3, ROWS * H));
         let loss = |params: &[f32], x: &[f32]| {
-            let state = run(&block, params, x, visible);
-            state.own().iter().zip(&to).map(|(own, to)| f64::from(own * to)).sum()
+            let said = run(&block, params, x, visible);
+            said.own.iter().zip(&to).map(|(own, to)| f64::from(own * to)).sum()
         };
-        let mut state = run(&block, &params, &x, visible);
+        let said = run(&block, &params, &x, visible);
         let (mut grads, mut dx) = (vec![0.0; len], vec![9.0; x.len()]);
         block.backward(
             &params,
             places(&groups(), visible),
             View::dense(&x, H),
-            &mut state,
+            &said.state,
             View::dense(&to, H),
             ViewMut::dense(&mut dx, H),
             &mut grads,
