@@ -14,6 +14,7 @@ mod config;
 pub mod contrastive;
 pub mod decoder;
 pub mod encoder;
+pub mod estimators;
 pub mod learner;
 pub mod method;
 mod methods;

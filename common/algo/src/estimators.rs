@@ -1,0 +1,4 @@
+//! What learning is made of, as pure functions of numbers: each with a table by hand as its test.
+
+pub mod dissimilarity;
+pub mod roles;
