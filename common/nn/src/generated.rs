@@ -1,7 +1,6 @@
 //! A linear layer whose weight another layer makes for each row (a hyper-network's layer).
 
-use crate::{Linear, View, ViewMut, matmul, vectorized};
-use faer::Accum;
+use crate::{Accum, Linear, View, ViewMut, matmul, vectorized};
 
 /// y = xᵀ W + `head bias`, where row by row W = `weight`(c) as (inputs, outputs): entry (i, o) is output
 /// `i · outputs + o` of that layer. `bias`(c) adds the rest.

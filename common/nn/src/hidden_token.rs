@@ -299,11 +299,11 @@ impl HiddenToken {
     ) {
         let (h, a) = (self.dim(), self.attention.dim);
         let u = &mut state.u[rows.start * h..rows.end * h];
-        match previous {
-            Some(previous) => {
-                (u.chunks_exact_mut(h).enumerate()).for_each(|(row, u)| u.copy_from_slice(previous.row(row)))
+        for (row, u) in u.chunks_exact_mut(h).enumerate() {
+            match previous {
+                Some(previous) => u.copy_from_slice(previous.row(row)),
+                None => u.fill(0.0),
             }
-            None => u.fill(0.0),
         }
         let u = View::dense(u, h);
         self.attention.query.forward(params, u, ViewMut::dense(&mut state.queries, a).rows(rows.clone()));
@@ -348,7 +348,8 @@ impl HiddenTokenState {
 }
 
 impl<'a> Places<'a> {
-    fn rows(&self) -> usize {
+    /// Agent rows, R.
+    pub(crate) fn rows(&self) -> usize {
         self.agent_times.last().copied().unwrap_or(0)
     }
 

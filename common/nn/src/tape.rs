@@ -63,7 +63,12 @@
 
 mod attention;
 mod backward;
+mod detach;
+mod gaussian;
+mod generated;
 mod gru;
+mod hidden_token;
+mod leaky_relu;
 mod linear;
 mod members;
 mod rows;
@@ -273,6 +278,14 @@ impl<'a> Tape<'a> {
         let rows = buffer.len() / cols.max(1);
         let var = self.node(Place::Here(buffer), rows, cols);
         self.gradients.declare(rows, cols, self.recording);
+        var
+    }
+
+    /// Makes a written buffer a value of this many columns that wants no gradient.
+    pub fn push_detached(&mut self, buffer: Buffer, cols: usize) -> Var {
+        let rows = buffer.len() / cols.max(1);
+        let var = self.node(Place::Here(buffer), rows, cols);
+        self.gradients.declare(rows, cols, false);
         var
     }
 
