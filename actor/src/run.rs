@@ -58,6 +58,8 @@ pub enum Learner {
 pub struct ActorOptions {
     /// Unique among the run's actors.
     pub name: String,
+    /// The place that the supervisor of the learner's host fills with this actor, if one does.
+    pub slot: Option<u32>,
     /// Whether somebody sees to it that there is a learner, so that one that is away is waited for from the start.
     pub supervised: bool,
 }
@@ -82,6 +84,9 @@ pub enum ActorError {
     /// An actor of this name is there already, or the builds differ.
     #[error("the learner refused: {0}")]
     Refused(String),
+    /// Another process of its slot has come.
+    #[error("{0}")]
+    Replaced(String),
     /// The learner's configuration means nothing here.
     #[error("the learner's configuration cannot be used: {0}; use the same build")]
     Config(#[from] rit_config::ConfigError),
@@ -125,6 +130,7 @@ impl ActorError {
             | Self::LearnerGone(_)
             | Self::Rollout(RolloutError::Weights(_) | RolloutError::Send(_)) => true,
             Self::Refused(_)
+            | Self::Replaced(_)
             | Self::Config(_)
             | Self::RunId
             | Self::Random(_)
@@ -228,6 +234,7 @@ impl Actor {
             layout_version: wire::LAYOUT_VERSION,
             instance: self.instance,
             remote: matches!(self.learner, Learner::At(..)),
+            slot: self.options.slot,
         };
         outbox.try_send(say(actor_message::Message::Hello(hello))).map_err(|error| gone(&error))?;
         let answer = RolloutClient::new(client.clone()).join(ReceiverStream::new(messages)).await;
@@ -313,6 +320,9 @@ async fn converse(
                 Ok(Some(learner_message::Message::Farewell(_))) => return Ok(()),
                 Ok(Some(learner_message::Message::Welcome(_))) => continue,
                 Ok(None) => return Err(gone(&"its stream ended without a farewell")),
+                Err(status) if status.code() == Code::AlreadyExists => {
+                    return Err(ActorError::Replaced(status.message().to_owned()));
+                }
                 Err(status) => return Err(gone(&status.message())),
             },
             Some(lease) = lease_done.recv() => actor_message::Message::Done(Done { lease }),

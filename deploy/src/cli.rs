@@ -118,6 +118,9 @@ pub struct ActorOptions {
     /// Name of this actor, unique in its run
     #[arg(long, default_value = "actor-0")]
     pub name: String,
+    /// Slot that `rit train` fills with this actor: its identity, which it takes over from whoever held it before
+    #[arg(long, value_name = "N", hide = true)]
+    pub slot: Option<u32>,
     /// Stop when standard input ends: whoever started this process has gone
     #[arg(long, hide = true)]
     pub supervised: bool,

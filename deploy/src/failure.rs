@@ -10,6 +10,10 @@ use std::{fmt, process::ExitCode};
 /// Exit code of a run that was interrupted and ended in order, as shells have it for Ctrl-C.
 pub const INTERRUPTED: u8 = 130;
 
+/// Exit code of a learner under `rit train` when the system refuses now what it may grant later (shared memory, a port),
+/// as `sysexits.h` has it for a failure that passes: the supervisor starts it again.
+pub const UNAVAILABLE: u8 = 75;
+
 /// A failed command.
 #[derive(Debug)]
 pub enum Failure {
@@ -17,6 +21,8 @@ pub enum Failure {
     Input(anyhow::Error),
     /// Something failed on the way: exit code 1.
     Runtime(anyhow::Error),
+    /// The system refuses what it may grant later: exit code 75.
+    Unavailable(anyhow::Error),
 }
 
 impl Failure {
@@ -47,6 +53,7 @@ impl Failure {
         ExitCode::from(match self {
             Self::Input(_) => 2,
             Self::Runtime(_) => 1,
+            Self::Unavailable(_) => UNAVAILABLE,
         })
     }
 }
@@ -54,7 +61,7 @@ impl Failure {
 impl fmt::Display for Failure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Input(error) | Self::Runtime(error) => write!(f, "{error:#}"),
+            Self::Input(error) | Self::Runtime(error) | Self::Unavailable(error) => write!(f, "{error:#}"),
         }
     }
 }
@@ -104,12 +111,12 @@ impl From<CredentialsError> for Failure {
 impl From<LearnerError> for Failure {
     fn from(error: LearnerError) -> Self {
         match error {
-            LearnerError::Access(_)
-            | LearnerError::Address(_)
-            | LearnerError::Listen(_)
+            LearnerError::Listen(_)
             | LearnerError::Web(_)
             | LearnerError::RunSpace(_)
-            | LearnerError::SharedMemory(_)
+            | LearnerError::SharedMemory(_) => Self::Unavailable(error.into()),
+            LearnerError::Access(_)
+            | LearnerError::Address(_)
             | LearnerError::Model(_)
             | LearnerError::Checkpoint(_) => Self::input(error),
             _ => Self::runtime(error),
@@ -126,9 +133,7 @@ impl From<ActorError> for Failure {
             | ActorError::Refused(_)
             | ActorError::Config(_)
             | ActorError::RunId
-            | ActorError::Model(_)
-            | ActorError::RunSpace(_)
-            | ActorError::SharedMemory(_) => Self::input(error),
+            | ActorError::Model(_) => Self::input(error),
             _ => Self::runtime(error),
         }
     }

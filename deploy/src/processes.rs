@@ -21,7 +21,12 @@ pub async fn learner(options: LearnerOptions, logs: LogOptions) -> Result<ExitCo
     }
     let (run_dir, config) = RunDir::open(&options.run_dir)?;
     let shutdown = shutdown::requested(options.supervised);
-    let summary = rit_learner::run(run_dir, config, set_log, shutdown).instrument(span).await?;
+    let ended = rit_learner::run(run_dir, config, set_log, shutdown).instrument(span).await;
+    let summary = ended.map_err(|error| match Failure::from(error) {
+        // For people, what they gave it does not fit what is there.
+        Failure::Unavailable(error) if !options.supervised => Failure::Input(error),
+        failure => failure,
+    })?;
     tracing::info!(
         digest = summary.weights_digest,
         env_steps = summary.progress.env_steps,
@@ -41,7 +46,8 @@ pub async fn actor(options: ActorOptions, logs: LogOptions) -> Result<ExitCode, 
         }
     };
     let shutdown = shutdown::requested(options.supervised);
-    let options = rit_actor::ActorOptions { name: options.name, supervised: options.supervised };
+    let options =
+        rit_actor::ActorOptions { name: options.name, slot: options.slot, supervised: options.supervised };
     rit_actor::run(learner, options, shutdown).instrument(span).await?;
     Ok(ExitCode::SUCCESS)
 }

@@ -1,161 +1,482 @@
-//! Child processes of `rit train`: started by executing this program again, watched, restarted, ended.
+//! Who of a run's processes is started, asked to end and killed, and when: the decisions of `rit train` as a state
+//! machine. It is told what happened and at what time, and answers with what is to be done; processes, clocks and
+//! sockets are its shell's (`supervisor/shell.rs`). So the simulator (`soak/simulated`) drives this very code.
+//!
+//! An actor is its slot. Slots below the wanted count are filled, each by one process at a time, whatever died, left
+//! or was started in whatever order; a slot that is wanted again while its process still leaves waits for its end.
 
-use crate::{failure::Failure, logging::LogOptions};
-use std::{
-    fs::{self, OpenOptions},
-    io,
-    path::{Path, PathBuf},
-    process::{ExitStatus, Stdio},
-    time::{Duration, Instant},
-};
-use tokio::process::{Child, ChildStdin, Command};
+mod messages;
+mod process;
+mod restarts;
+mod shell;
+#[cfg(test)]
+mod tests;
 
-/// An actor that dies this often within [`RESTART_WINDOW`] is given up, and the run with it.
-const RESTARTS_MAX: usize = 5;
+use crate::failure::UNAVAILABLE;
+use restarts::{DEATHS_MAX, Restarts};
+use std::{collections::BTreeMap, time::Duration};
 
-/// See [`RESTARTS_MAX`].
-const RESTART_WINDOW: Duration = Duration::from_secs(60);
+pub use messages::{Effect, Event, Exit, Hung, Outcome, Place, Standing};
+pub use shell::watch_over;
 
-/// How long children may take to end once asked, before they are killed.
+/// How long a learner may take to answer.
+const START_TIMEOUT: Duration = Duration::from_secs(30);
+
+/// How long processes may take to end once asked, before they are killed.
 const END_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// A child process. Its standard input is a lifeline: it ends in order when this process does, however that
-/// comes about.
-#[derive(Debug)]
-pub struct Process {
-    name: String,
-    command: Vec<String>,
-    log: PathBuf,
-    child: Child,
-    /// Waiting for a child closes the input it still holds, so the lifeline is held here.
-    lifeline: Option<ChildStdin>,
-    starts: Vec<Instant>,
+/// A learner that has not answered for so long hangs, and is killed.
+const SILENCE_MAX: Duration = Duration::from_secs(30);
+
+/// ... but only if it was asked in vain so often: else this process itself stood still.
+const SILENT_ASKS_MIN: u32 = 5;
+
+/// The process of one place.
+#[derive(Debug, Default)]
+struct Process {
+    state: State,
+    restarts: Restarts,
+}
+
+#[derive(Debug, Default)]
+enum State {
+    /// None, and none is awaited.
+    #[default]
+    Down,
+    /// None, and it is started at this moment.
+    Due(Duration),
+    Up(Up),
+}
+
+/// A process that was started and has not ended.
+#[derive(Debug, Default)]
+struct Up {
+    pid: Option<u32>,
+    asked_to_end: bool,
+    /// When it is killed unless it has ended.
+    kill_at: Option<Duration>,
+    killed: bool,
 }
 
 impl Process {
-    /// Starts `rit` with these arguments; its standard error goes to `{logs}/{name}.log`.
-    ///
-    /// # Errors
-    /// When the system refuses.
-    pub fn start(
-        name: &str,
-        mut command: Vec<String>,
-        logs: &Path,
-        log_options: &LogOptions,
-    ) -> Result<Self, Failure> {
-        command.push("--supervised".into());
-        command.extend(log_options.arguments());
-        let log = logs.join(format!("{name}.log"));
-        let mut child = spawn(&command, &log).map_err(|error| cannot_start(name, &error))?;
-        let lifeline = child.stdin.take();
-        Ok(Self { name: name.to_owned(), command, log, child, lifeline, starts: vec![Instant::now()] })
-    }
-
-    /// Its name.
-    pub fn name(&self) -> &str {
-        &self.name
-    }
-
-    /// Its process, while it lives.
-    pub fn id(&self) -> Option<u32> {
-        self.child.id()
-    }
-
-    /// Asks it to end in order; [`Process::wait`] sees its end.
-    pub fn ask_to_end(&mut self) {
-        self.lifeline = None;
-    }
-
-    /// Whether it was asked to end.
-    pub fn is_ending(&self) -> bool {
-        self.lifeline.is_none()
-    }
-
-    /// Kills it; [`Process::wait`] sees its end.
-    pub fn start_kill(&mut self) {
-        // Dead already is as good.
-        let _ = self.child.start_kill();
-    }
-
-    /// Waits for its end.
-    pub async fn wait(&mut self) -> io::Result<ExitStatus> {
-        self.child.wait().await
-    }
-
-    /// Whether it may be started again.
-    ///
-    /// # Errors
-    /// When it has died too often of late.
-    pub fn may_restart(&mut self) -> Result<(), Failure> {
-        self.starts.retain(|start| start.elapsed() < RESTART_WINDOW);
-        if self.starts.len() >= RESTARTS_MAX {
-            let (name, seconds) = (&self.name, RESTART_WINDOW.as_secs());
-            return Err(Failure::runtime_message(format!(
-                "{name} died {RESTARTS_MAX} times within {seconds} s and is given up: {}",
-                self.last_words()
-            )));
+    fn up(&mut self) -> Option<&mut Up> {
+        match &mut self.state {
+            State::Up(up) => Some(up),
+            _ => None,
         }
-        Ok(())
     }
 
-    /// Starts it again.
-    ///
-    /// # Errors
-    /// When it may not be, or the system refuses.
-    pub fn restart(&mut self) -> Result<(), Failure> {
-        self.may_restart()?;
-        self.starts.push(Instant::now());
-        self.child = spawn(&self.command, &self.log).map_err(|error| cannot_start(&self.name, &error))?;
-        self.lifeline = self.child.stdin.take();
-        Ok(())
+    fn is_up(&self) -> bool {
+        matches!(self.state, State::Up(_))
     }
 
-    /// Where it logs.
-    pub fn log(&self) -> &Path {
-        &self.log
-    }
-
-    /// The last line of its log.
-    pub fn last_words(&self) -> String {
-        let text = fs::read_to_string(&self.log).unwrap_or_default();
-        let last = text.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("it said nothing");
-        last.trim_start_matches("error: ").to_owned()
-    }
-
-    /// Closes the lifeline and waits; kills what does not end in time.
-    pub async fn end(&mut self) {
-        self.lifeline = None;
-        if tokio::time::timeout(END_TIMEOUT, self.child.wait()).await.is_err() {
-            tracing::warn!(name = self.name, "does not end and is killed");
-            // Ended in the meantime is as good.
-            let _ = self.child.kill().await;
+    /// When something is to be done about it.
+    fn deadline(&self) -> Option<Duration> {
+        match &self.state {
+            State::Down => None,
+            State::Due(at) => Some(*at),
+            State::Up(up) => up.kill_at.filter(|_| !up.killed),
         }
     }
 }
 
-fn spawn(command: &[String], log: &Path) -> io::Result<Child> {
-    let log = OpenOptions::new().create(true).append(true).open(log)?;
-    Command::new(std::env::current_exe()?)
-        .args(command)
-        .stdin(Stdio::piped())
-        .stdout(Stdio::null())
-        .stderr(log)
-        // A terminal's Ctrl-C reaches this process alone, which then ends the others in order.
-        .process_group(0)
-        .kill_on_drop(true)
-        .spawn()
+/// What all processes are up to.
+#[derive(Debug)]
+enum Phase {
+    /// Training.
+    Running,
+    /// All of them end, to be started anew: the learner at this moment or later.
+    Anew(Duration),
+    /// All of them end, for good.
+    Ending(Outcome),
+    /// Nothing more is to be done.
+    Over,
 }
 
-fn cannot_start(name: &str, error: &io::Error) -> Failure {
-    Failure::runtime_message(format!("cannot start {name}: {error}"))
+/// How reachable the learner is.
+#[derive(Debug)]
+enum Contact {
+    /// It has not answered since it was started at this moment; why it was not reached last.
+    Starting(Duration, String),
+    /// It answered last at this moment, and was asked in vain so often since.
+    Answering(Duration, u32),
 }
 
-/// How a process ended, in words.
-pub fn in_words(status: ExitStatus) -> String {
-    use std::os::unix::process::ExitStatusExt as _;
-    match (status.code(), status.signal()) {
-        (Some(code), _) => format!("ended with exit code {code}"),
-        (None, Some(signal)) => format!("was ended by signal {signal}"),
-        (None, None) => "ended".to_owned(),
+/// The supervisor.
+#[derive(Debug)]
+pub struct Supervisor {
+    phase: Phase,
+    learner: Process,
+    contact: Contact,
+    actors: BTreeMap<u32, Process>,
+    /// Actors that are to run.
+    wanted: u32,
+    /// A learner has answered at some time: what fails now is not what was typed.
+    begun: bool,
+    interrupted: bool,
+    /// The learner is writing its last files.
+    run_ends: bool,
+    /// Folder of the processes' logs, for messages.
+    logs: String,
+}
+
+impl Supervisor {
+    /// A supervisor of a run with so many actors at first, whose processes log to this folder.
+    pub fn new(actors: u32, logs: String) -> Self {
+        Self {
+            phase: Phase::Running,
+            learner: Process::default(),
+            contact: Contact::Starting(Duration::ZERO, String::new()),
+            actors: BTreeMap::new(),
+            wanted: actors,
+            begun: false,
+            interrupted: false,
+            run_ends: false,
+            logs,
+        }
+    }
+
+    /// When [`Event::Tick`] is due next, if ever.
+    pub fn deadline(&self) -> Option<Duration> {
+        let start = match (&self.phase, &self.contact) {
+            (Phase::Running, Contact::Starting(since, _)) if self.learner.is_up() => {
+                Some(*since + START_TIMEOUT)
+            }
+            _ => None,
+        };
+        self.processes().filter_map(Process::deadline).chain(start).min()
+    }
+
+    /// What is to be done after what happened at this moment, counted from any fixed one.
+    pub fn handle(&mut self, event: Event, now: Duration) -> Vec<Effect> {
+        let mut effects = Vec::new();
+        match event {
+            Event::Begin => self.start(Place::Learner, now, &mut effects),
+            Event::Started(place, pid) => {
+                if let Some(up) = self.process(place).up() {
+                    up.pid = Some(pid);
+                }
+            }
+            Event::Ended { place: Place::Learner, exit, last_words } => {
+                self.learner_ended(&exit, &last_words, now, &mut effects);
+            }
+            Event::Ended { place: Place::Actor(slot), exit, last_words } => {
+                self.actor_ended(slot, &exit, &last_words, now, &mut effects);
+            }
+            Event::Answers => self.answers(now, &mut effects),
+            Event::Status(standing) => self.status(&standing, now, &mut effects),
+            Event::NoAnswer(why) => self.no_answer(why, now, &mut effects),
+            Event::Interrupted => self.interrupt(now, &mut effects),
+            Event::Tick => self.tick(now, &mut effects),
+        }
+        effects
+    }
+
+    fn processes(&self) -> impl Iterator<Item = &Process> {
+        std::iter::once(&self.learner).chain(self.actors.values())
+    }
+
+    fn process(&mut self, place: Place) -> &mut Process {
+        match place {
+            Place::Learner => &mut self.learner,
+            Place::Actor(slot) => self.actors.entry(slot).or_default(),
+        }
+    }
+
+    fn start(&mut self, place: Place, now: Duration, effects: &mut Vec<Effect>) {
+        let process = self.process(place);
+        process.state = State::Up(Up::default());
+        process.restarts.started(now);
+        if place == Place::Learner {
+            (self.contact, self.run_ends) = (Contact::Starting(now, String::new()), false);
+        }
+        effects.push(Effect::Start(place));
+    }
+
+    fn ask_to_end(&mut self, place: Place, kill_at: Option<Duration>, effects: &mut Vec<Effect>) {
+        let Some(up) = self.process(place).up() else { return };
+        up.kill_at = up.kill_at.or(kill_at);
+        if !std::mem::replace(&mut up.asked_to_end, true) {
+            effects.push(Effect::AskToEnd(place));
+        }
+    }
+
+    fn kill(&mut self, place: Place, effects: &mut Vec<Effect>) {
+        if let Some(up) = self.process(place).up()
+            && !std::mem::replace(&mut up.killed, true)
+        {
+            effects.push(Effect::Kill(place));
+        }
+    }
+
+    /// Fills the slots that are wanted, and lets the others' actors go.
+    fn adjust_actors(&mut self, now: Duration, effects: &mut Vec<Effect>) {
+        let may_start = matches!(self.contact, Contact::Answering(..))
+            && matches!(self.phase, Phase::Running)
+            && !self.interrupted
+            && !self.run_ends;
+        let wanted = self.wanted;
+        for slot in 0..wanted {
+            let down = self.actors.get(&slot).is_none_or(|actor| matches!(actor.state, State::Down));
+            if may_start && down {
+                self.start(Place::Actor(slot), now, effects);
+            }
+        }
+        self.actors.retain(|&slot, actor| slot < wanted || actor.is_up());
+        let beyond: Vec<u32> = self.actors.range(wanted..).map(|(&slot, _)| slot).collect();
+        for slot in beyond {
+            let before = effects.len();
+            self.ask_to_end(Place::Actor(slot), None, effects);
+            if effects.len() > before {
+                let say = format!("{wanted} actors are wanted: {} leaves", Place::Actor(slot));
+                effects.push(Effect::Say(say));
+            }
+        }
+    }
+
+    fn answers(&mut self, now: Duration, effects: &mut Vec<Effect>) {
+        if !self.learner.is_up() || !matches!(self.phase, Phase::Running) {
+            return;
+        }
+        self.begun = true;
+        self.contact = Contact::Answering(now, 0);
+        if self.interrupted {
+            effects.push(Effect::StopRun);
+        }
+        self.adjust_actors(now, effects);
+    }
+
+    fn status(&mut self, standing: &Standing, now: Duration, effects: &mut Vec<Effect>) {
+        if !matches!(self.contact, Contact::Answering(..)) {
+            return;
+        }
+        self.contact = Contact::Answering(now, 0);
+        self.run_ends |= standing.ending;
+        for Hung { pid, silent_s } in &standing.hung {
+            let is_it =
+                |actor: &Process| matches!(&actor.state, State::Up(up) if up.pid == Some(*pid) && !up.killed);
+            let slot = self.actors.iter().find(|(_, actor)| is_it(actor)).map(|(&slot, _)| slot);
+            if let Some(slot) = slot {
+                effects.push(Effect::Say(format!("actor-{slot} has hung for {silent_s} s and is killed")));
+                self.kill(Place::Actor(slot), effects);
+            }
+        }
+        if self.interrupted || self.run_ends {
+            // Likewise.
+            self.actors.retain(|_, actor| actor.is_up());
+            return;
+        }
+        if standing.actors_wanted > self.wanted {
+            effects.push(Effect::Say(format!("{} actors are wanted", standing.actors_wanted)));
+        }
+        self.wanted = standing.actors_wanted;
+        self.adjust_actors(now, effects);
+    }
+
+    fn no_answer(&mut self, why: String, now: Duration, effects: &mut Vec<Effect>) {
+        match &mut self.contact {
+            Contact::Starting(_, last) => *last = why,
+            Contact::Answering(since, asks) => {
+                *asks += 1;
+                let silent = now.saturating_sub(*since);
+                let hangs = silent >= SILENCE_MAX && *asks >= SILENT_ASKS_MIN && !self.run_ends;
+                if hangs && self.learner.up().is_some_and(|up| !up.killed) {
+                    let seconds = silent.as_secs();
+                    effects.push(Effect::Say(format!(
+                        "the learner has not answered for {seconds} s and is killed ({why})"
+                    )));
+                    self.kill(Place::Learner, effects);
+                }
+            }
+        }
+    }
+
+    fn interrupt(&mut self, now: Duration, effects: &mut Vec<Effect>) {
+        if std::mem::replace(&mut self.interrupted, true)
+            || matches!(self.phase, Phase::Ending(_) | Phase::Over)
+        {
+            return;
+        }
+        effects.push(Effect::Say("interrupted: ending the run in order".to_owned()));
+        // Who is not there is not needed any more.
+        self.actors.retain(|_, actor| actor.is_up());
+        match (&self.phase, &self.contact) {
+            (Phase::Running, Contact::Answering(..)) if self.learner.is_up() => {
+                effects.push(Effect::StopRun);
+            }
+            // One that has not answered yet is asked when it does.
+            (Phase::Running, Contact::Starting(..)) if self.learner.is_up() => {}
+            _ => self.end(Outcome::Interrupted, now, effects),
+        }
+    }
+
+    fn learner_ended(&mut self, exit: &Exit, last_words: &str, now: Duration, effects: &mut Vec<Effect>) {
+        let was_anew = matches!(self.phase, Phase::Anew(_));
+        self.learner.state = State::Down;
+        if was_anew || matches!(self.phase, Phase::Ending(_) | Phase::Over) {
+            self.go_on_if_all_are_down(effects);
+            return;
+        }
+        let log = format!("{}/learner.log", self.logs);
+        let died = format!("the learner {exit}: {last_words} (log: {log})");
+        self.contact = Contact::Starting(now, String::new());
+        match exit {
+            Exit::Code(0) if self.interrupted => self.end(Outcome::Interrupted, now, effects),
+            Exit::Code(0) => self.end(Outcome::Finished, now, effects),
+            _ if self.interrupted => self.fail(false, died, now, effects),
+            // What was typed or given is wrong, and will be the second time.
+            Exit::Code(2) => self.fail(true, last_words.to_owned(), now, effects),
+            // It cannot have now what it had before: memory, a port, room on the disk.
+            Exit::Code(code) if *code == i32::from(UNAVAILABLE) && self.begun => {
+                self.begin_anew(&died, last_words, now, effects);
+            }
+            Exit::Code(code) if *code == i32::from(UNAVAILABLE) => {
+                self.fail(true, last_words.to_owned(), now, effects);
+            }
+            // What it said itself would be no better a second time.
+            Exit::Code(_) => self.fail(false, died, now, effects),
+            Exit::NotStarted(why) if !self.begun => {
+                self.fail(false, format!("cannot start the learner: {why}"), now, effects);
+            }
+            // What ended it from outside may be.
+            Exit::Signal(_) | Exit::NotStarted(_) => {
+                self.restart(Place::Learner, exit, last_words, now, effects);
+            }
+        }
+    }
+
+    fn actor_ended(
+        &mut self,
+        slot: u32,
+        exit: &Exit,
+        last_words: &str,
+        now: Duration,
+        effects: &mut Vec<Effect>,
+    ) {
+        let Some(actor) = self.actors.get_mut(&slot) else { return };
+        let left = actor.up().is_some_and(|up| up.asked_to_end);
+        actor.state = State::Down;
+        if !matches!(self.phase, Phase::Running) {
+            self.go_on_if_all_are_down(effects);
+            return;
+        }
+        if self.interrupted || self.run_ends || slot >= self.wanted {
+            self.actors.remove(&slot);
+        } else if left {
+            // It was not wanted for a while, and is again.
+            self.adjust_actors(now, effects);
+        } else if *exit == Exit::Code(2) {
+            // What was given is wrong, and will be the second time.
+            self.fail(true, format!("{}: {last_words}", Place::Actor(slot)), now, effects);
+        } else {
+            self.restart(Place::Actor(slot), exit, last_words, now, effects);
+        }
+    }
+
+    /// Starts a process again that died, now or later; gives the run up when it dies again and again.
+    fn restart(
+        &mut self,
+        place: Place,
+        exit: &Exit,
+        last_words: &str,
+        now: Duration,
+        effects: &mut Vec<Effect>,
+    ) {
+        let Some(delay) = self.process(place).restarts.died(now) else {
+            return self.give_up(place, last_words, now, effects);
+        };
+        let words = match exit {
+            Exit::Code(0) => "has left".to_owned(),
+            exit => exit.to_string(),
+        };
+        let when = if delay.is_zero() { String::new() } else { format!(" in {} s", delay.as_secs_f64()) };
+        let name = if place == Place::Learner { "the learner".to_owned() } else { place.to_string() };
+        effects.push(Effect::Say(format!("{name} {words} and is restarted{when}")));
+        if delay.is_zero() {
+            self.start(place, now, effects);
+        } else {
+            self.process(place).state = State::Due(now + delay);
+        }
+    }
+
+    fn give_up(&mut self, place: Place, last_words: &str, now: Duration, effects: &mut Vec<Effect>) {
+        let message = format!("{place} died {DEATHS_MAX} times in a row and is given up: {last_words}");
+        self.fail(false, message, now, effects);
+    }
+
+    /// Ends all processes, then starts all of them: a learner could not begin beside the actors there are.
+    fn begin_anew(&mut self, why: &str, last_words: &str, now: Duration, effects: &mut Vec<Effect>) {
+        let Some(delay) = self.learner.restarts.died(now) else {
+            return self.give_up(Place::Learner, last_words, now, effects);
+        };
+        effects.push(Effect::Say(format!("{why}; the actors are started anew too")));
+        self.phase = Phase::Anew(now + delay);
+        self.end_processes(now, effects);
+        self.go_on_if_all_are_down(effects);
+    }
+
+    fn fail(&mut self, input: bool, message: String, now: Duration, effects: &mut Vec<Effect>) {
+        self.end(Outcome::Failed { input, message }, now, effects);
+    }
+
+    fn end(&mut self, outcome: Outcome, now: Duration, effects: &mut Vec<Effect>) {
+        self.phase = Phase::Ending(outcome);
+        self.end_processes(now, effects);
+        self.go_on_if_all_are_down(effects);
+    }
+
+    fn end_processes(&mut self, now: Duration, effects: &mut Vec<Effect>) {
+        let slots: Vec<u32> = self.actors.keys().copied().collect();
+        for place in slots.into_iter().map(Place::Actor).chain([Place::Learner]) {
+            let process = self.process(place);
+            if matches!(process.state, State::Due(_)) {
+                process.state = State::Down;
+            }
+            self.ask_to_end(place, Some(now + END_TIMEOUT), effects);
+        }
+    }
+
+    /// The end, or the new beginning, once no process lives.
+    fn go_on_if_all_are_down(&mut self, effects: &mut Vec<Effect>) {
+        if self.processes().any(Process::is_up) {
+            return;
+        }
+        match std::mem::replace(&mut self.phase, Phase::Over) {
+            Phase::Anew(due) => {
+                self.phase = Phase::Running;
+                self.actors.clear();
+                self.learner.state = State::Due(due);
+                effects.push(Effect::RemoveSharedMemory);
+            }
+            Phase::Ending(outcome) => effects.push(Effect::Over(outcome)),
+            other => self.phase = other,
+        }
+    }
+
+    fn tick(&mut self, now: Duration, effects: &mut Vec<Effect>) {
+        let slots: Vec<u32> = self.actors.keys().copied().collect();
+        for place in slots.into_iter().map(Place::Actor).chain([Place::Learner]) {
+            match &self.process(place).state {
+                State::Due(at) if *at <= now => self.start(place, now, effects),
+                State::Up(Up { kill_at: Some(at), .. }) if *at <= now => self.kill(place, effects),
+                _ => {}
+            }
+        }
+        let late = match &self.contact {
+            Contact::Starting(since, why) if now.saturating_sub(*since) >= START_TIMEOUT => Some(why.clone()),
+            _ => None,
+        };
+        if let Some(why) = late.filter(|_| self.learner.is_up() && matches!(self.phase, Phase::Running)) {
+            let seconds = START_TIMEOUT.as_secs();
+            let message = format!(
+                "the learner does not answer after {seconds} s: {why} (log: {}/learner.log)",
+                self.logs
+            );
+            if self.begun && !self.interrupted {
+                self.begin_anew(&message, &why, now, effects);
+            } else {
+                self.fail(false, message, now, effects);
+            }
+        }
     }
 }

@@ -112,6 +112,36 @@ fn settings_change_while_the_run_goes_on() {
     train.finish();
 }
 
+/// Counts that change faster than actors come and go: each slot is filled once, and the run goes on.
+#[test]
+fn the_number_of_actors_may_change_again_and_again() {
+    let folder = RunFolder::new();
+    let mut train = folder.start(&["matrix-game", "--actors", "2", "--seed", "1"]);
+    train.wait_for("training", |status| status["updates"].as_u64() > Some(10));
+    for count in ["6", "1", "6", "2", "5", "0", "4", "1", "3"] {
+        let answer = train.ctl(&["set", &format!("actors.count={count}")]);
+        let stderr = String::from_utf8_lossy(&answer.stderr);
+        if count == "0" {
+            assert_eq!(answer.status.code(), Some(2), "{stderr}");
+            assert!(stderr.contains("`rit ctl pause` lets it rest"), "{stderr}");
+        } else {
+            assert!(answer.status.success(), "{stderr}");
+        }
+    }
+    train.wait_for("the three that are wanted", |status| {
+        let mut names: Vec<_> = status["actors"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|actor| actor["name"].as_str().unwrap())
+            .collect();
+        names.sort_unstable();
+        names == ["actor-0", "actor-1", "actor-2"]
+    });
+    json(&train.ctl(&["stop"]));
+    train.finish();
+}
+
 #[test]
 fn a_drained_run_has_nothing_under_way_and_goes_on_to_the_same_weights() {
     let steps = ["matrix-game", "--seed", "3", "--steps", "3000"];

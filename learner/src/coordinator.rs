@@ -76,6 +76,8 @@ struct Actor {
     pid: u32,
     /// Tells the process from another of this name.
     instance: u64,
+    /// Its identity, where a supervisor fills slots.
+    slot: Option<u32>,
     /// On another host.
     remote: bool,
     to: async_mpsc::Sender<Result<LearnerMessage, Status>>,
@@ -313,17 +315,21 @@ impl Coordinator {
         hello: v1::Hello,
         to: async_mpsc::Sender<Result<LearnerMessage, Status>>,
     ) -> Result<ActorId, Status> {
-        let v1::Hello { name, pid, layout_version, instance, remote } = hello;
+        let v1::Hello { name, pid, layout_version, instance, remote, slot } = hello;
         if layout_version != wire::LAYOUT_VERSION {
             return Err(Status::failed_precondition(format!(
                 "actor {name} writes frame layout {layout_version}, this learner reads {}; use the same build",
                 wire::LAYOUT_VERSION
             )));
         }
-        // The same process, whose link broke before this side noticed; or the successor of one given up.
-        let follows = |other: &Actor| other.name == name && (other.instance == instance || other.hung);
+        // The same process, whose link broke before this side noticed; the successor of one given up; or, in a slot,
+        // whoever comes later: the supervisor starts nobody beside another.
+        let follows = |other: &Actor| match (slot, other.slot) {
+            (None, None) => other.name == name && (other.instance == instance || other.hung),
+            (ours, theirs) => ours == theirs,
+        };
         if let Some(former) = self.actors.iter().find(|(_, other)| follows(other)).map(|(&id, _)| id) {
-            self.gone(former);
+            self.replace(former, instance);
         }
         let remote_max = self.config.actors.remote;
         if remote && self.actors.values().filter(|actor| actor.remote).count() >= remote_max {
@@ -331,7 +337,8 @@ impl Coordinator {
                 "actor {name} is on another host, and the learner takes {remote_max} of those; set actors.remote higher"
             )));
         }
-        if let Some(other) = self.actors.values().find(|actor| actor.name == name) {
+        let same_name = self.actors.values().find(|actor| actor.name == name);
+        if let Some(other) = same_name.filter(|_| slot.is_none()) {
             return Err(Status::already_exists(format!(
                 "an actor named {name} is there already (process {}); choose another --name",
                 other.pid
@@ -347,6 +354,7 @@ impl Coordinator {
                 name,
                 pid,
                 instance,
+                slot,
                 remote,
                 to,
                 episodes: 0,
@@ -358,6 +366,16 @@ impl Coordinator {
             },
         );
         Ok(id)
+    }
+
+    /// Lets a process of this instance take an actor's place. Another process that should still live is told.
+    fn replace(&mut self, former: ActorId, instance: u64) {
+        if let Some(actor) = self.actors.get(&former).filter(|actor| actor.instance != instance) {
+            let what = format!("another process has taken the place of {}", actor.name);
+            // One that is dead or does not read needs no word.
+            let _ = actor.to.try_send(Err(Status::already_exists(what)));
+        }
+        self.gone(former);
     }
 
     fn heard(&mut self, id: ActorId) {

@@ -69,6 +69,12 @@ pub enum ConfigError {
         /// The key.
         key: String,
     },
+    /// Nobody would roll episodes.
+    #[error(
+        "actors.count = 0 leaves the run nobody who rolls episodes; `rit ctl pause` lets it rest, and with actors.remote \
+         actors on other hosts may do all of it"
+    )]
+    NoActors,
     /// A key that a running learner cannot change.
     #[error("{key} cannot change while the learner runs; these can: {}", LIVE.join(", "))]
     NotLive {
@@ -175,6 +181,9 @@ pub fn set_live(config: &Config, settings: &[Table]) -> Result<Config, ConfigErr
         return Err(ConfigError::NotLive { key });
     }
     let (count, max) = (new.actors.count, new.actors.count_max);
+    if count == 0 && new.actors.remote == 0 {
+        return Err(ConfigError::NoActors);
+    }
     if count > max.max(config.actors.count) {
         let (key, value, max) = ("actors.count", count as f64, max as f64);
         return Err(ConfigError::Range { key, value, min: 0.0, max });

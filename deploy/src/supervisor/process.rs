@@ -1,0 +1,151 @@
+//! The child processes of `rit train`: this program, executed again.
+
+use super::{Exit, Place};
+use crate::logging::LogOptions;
+use std::{
+    collections::BTreeMap,
+    fs::{File, OpenOptions},
+    io::{self, Read as _, Seek as _, SeekFrom},
+    path::{Path, PathBuf},
+    process::{ExitStatus, Stdio},
+};
+use tokio::{
+    process::{Child, ChildStdin, Command},
+    sync::oneshot,
+    task::JoinSet,
+};
+
+/// How much of a log's end is looked through for its last line.
+const LAST_WORDS_BYTES: u64 = 16 << 10;
+
+/// The processes there are, by their places.
+#[derive(Debug)]
+pub struct Processes<'a> {
+    run_dir: &'a Path,
+    logs: PathBuf,
+    log_options: &'a LogOptions,
+    handles: BTreeMap<Place, Handle>,
+    /// Each waits for the end of one.
+    ends: JoinSet<(Place, io::Result<ExitStatus>)>,
+}
+
+/// What can be done to a process.
+#[derive(Debug)]
+struct Handle {
+    /// The process's standard input: it ends in order when this is closed, however that comes about. Waiting for a
+    /// child closes the input it still holds, so it is held here.
+    lifeline: Option<ChildStdin>,
+    kill: Option<oneshot::Sender<()>>,
+}
+
+impl<'a> Processes<'a> {
+    /// None yet; those of the run in `run_dir`, which log to `logs`.
+    pub fn new(run_dir: &'a Path, logs: PathBuf, log_options: &'a LogOptions) -> Self {
+        Self { run_dir, logs, log_options, handles: BTreeMap::new(), ends: JoinSet::new() }
+    }
+
+    /// Starts a process. Returns its number.
+    ///
+    /// # Errors
+    /// When the system refuses.
+    pub fn start(&mut self, place: Place) -> io::Result<Option<u32>> {
+        let log = OpenOptions::new().create(true).append(true).open(self.log(place))?;
+        let mut command = Command::new(std::env::current_exe()?);
+        match place {
+            Place::Learner => command.arg("learner"),
+            Place::Actor(slot) => {
+                command.args(["actor", "--name", &place.to_string(), "--slot", &slot.to_string()])
+            }
+        };
+        let mut child = command
+            .arg("--run-dir")
+            .arg(self.run_dir)
+            .arg("--supervised")
+            .args(self.log_options.arguments())
+            .stdin(Stdio::piped())
+            .stdout(Stdio::null())
+            .stderr(log)
+            // A terminal's Ctrl-C reaches this process alone, which then ends the others in order.
+            .process_group(0)
+            .kill_on_drop(true)
+            .spawn()?;
+        let (kill, killed) = oneshot::channel();
+        self.handles.insert(place, Handle { lifeline: child.stdin.take(), kill: Some(kill) });
+        let pid = child.id();
+        self.ends.spawn(async move { (place, end_of(child, killed).await) });
+        Ok(pid)
+    }
+
+    /// Asks a process to end in order.
+    pub fn ask_to_end(&mut self, place: Place) {
+        if let Some(handle) = self.handles.get_mut(&place) {
+            handle.lifeline = None;
+        }
+    }
+
+    /// Kills a process.
+    pub fn kill(&mut self, place: Place) {
+        if let Some(kill) = self.handles.get_mut(&place).and_then(|handle| handle.kill.take()) {
+            // Ended in the meantime is as good.
+            let _ = kill.send(());
+        }
+    }
+
+    /// The next process to end, and how. Never comes while there is none. What is dropped is not lost.
+    pub async fn next_end(&mut self) -> (Place, Exit) {
+        loop {
+            match self.ends.join_next().await {
+                Some(Ok((place, status))) => {
+                    self.handles.remove(&place);
+                    return (place, exit(status));
+                }
+                // Nobody aborts these tasks, and they do not panic.
+                Some(Err(error)) => tracing::error!(%error, "a process is not waited for any more"),
+                None => std::future::pending().await,
+            }
+        }
+    }
+
+    /// The last line of a process's log.
+    pub fn last_words(&self, place: Place) -> String {
+        let text = end_of_file(&self.log(place)).unwrap_or_default();
+        let text = String::from_utf8_lossy(&text);
+        let last = text.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("it said nothing");
+        last.trim_start_matches("error: ").to_owned()
+    }
+
+    fn log(&self, place: Place) -> PathBuf {
+        self.logs.join(format!("{place}.log"))
+    }
+}
+
+async fn end_of(mut child: Child, killed: oneshot::Receiver<()>) -> io::Result<ExitStatus> {
+    tokio::select! {
+        status = child.wait() => return status,
+        Ok(()) = killed => {}
+    }
+    // Ended in the meantime is as good.
+    let _ = child.start_kill();
+    child.wait().await
+}
+
+fn exit(status: io::Result<ExitStatus>) -> Exit {
+    use std::os::unix::process::ExitStatusExt as _;
+    match status {
+        Ok(status) => match (status.code(), status.signal()) {
+            (Some(code), _) => Exit::Code(code),
+            (None, signal) => Exit::Signal(signal.unwrap_or_default()),
+        },
+        // A child that cannot be waited for is as good as dead.
+        Err(error) => Exit::NotStarted(error.to_string()),
+    }
+}
+
+fn end_of_file(path: &Path) -> io::Result<Vec<u8>> {
+    let mut file = File::open(path)?;
+    let len = file.metadata()?.len();
+    file.seek(SeekFrom::Start(len.saturating_sub(LAST_WORDS_BYTES)))?;
+    let mut bytes = Vec::new();
+    file.read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
