@@ -28,6 +28,10 @@ pub struct Rollout {
     seed: RunSeed,
     random_permutation: bool,
     exploration_persistence: f32,
+    /// Whether actions are sampled from the policy.
+    sampled: bool,
+    /// Whether an episode that ends at the task's limit counts as cut off there.
+    time_limit_bootstraps: bool,
     /// Worlds that wait for their next episode, by task.
     idle: Vec<Vec<Seated>>,
 }
@@ -43,6 +47,9 @@ struct Running {
     previous_reward: f32,
     actions: Vec<Action>,
     builder: EpisodeBuilder,
+    /// Steps after which an end is the time limit's, not the task's; `None` where every end is the environment's.
+    time_limit: Option<usize>,
+    steps: usize,
 }
 
 impl Rollout {
@@ -59,12 +66,32 @@ impl Rollout {
     ) -> Self {
         assert!(!tasks.is_empty(), "a rollout needs a task");
         let idle = tasks.iter().map(|_| Vec::new()).collect();
-        Self { tasks, options, seed, random_permutation, exploration_persistence: 0.0, idle }
+        Self {
+            tasks,
+            options,
+            seed,
+            random_permutation,
+            exploration_persistence: 0.0,
+            sampled: false,
+            time_limit_bootstraps: false,
+            idle,
+        }
     }
 
     /// Explores with this probability that a random action is the agent's last random one again.
     pub fn with_exploration_persistence(self, exploration_persistence: f32) -> Self {
         Self { exploration_persistence, ..self }
+    }
+
+    /// Has actions sampled from the policy: what an on-policy method learns from. The jobs' ε has no say then.
+    pub fn sampled(self) -> Self {
+        Self { sampled: true, ..self }
+    }
+
+    /// Counts an episode as long as its task's limit as truncated, though the environment may call it terminated: for
+    /// methods whose values cannot tell how much time is left.
+    pub fn with_time_limit_bootstraps(self, time_limit_bootstraps: bool) -> Self {
+        Self { time_limit_bootstraps, ..self }
     }
 
     /// Rolls all jobs side by side to their ends and returns their episodes in the jobs' order.
@@ -121,17 +148,20 @@ impl Rollout {
         let mut observation = Observation::default();
         world.observe(&mut observation);
         policy.begin(slot, n_agents);
+        let rng = stream(Stream::Exploration);
+        let exploration = if self.sampled {
+            Exploration::sampling(rng)
+        } else {
+            Exploration::new(job.epsilon, self.exploration_persistence, n_agents, rng)
+        };
         Running {
             slot,
             task,
+            time_limit: self.time_limit_bootstraps.then(|| world.environment().steps_max()),
+            steps: 0,
             world,
             environment_rng,
-            exploration: Exploration::new(
-                job.epsilon,
-                self.exploration_persistence,
-                n_agents,
-                stream(Stream::Exploration),
-            ),
+            exploration,
             builder: EpisodeBuilder::new(job.number, job.weights_version, task, order, &observation),
             observation,
             previous_reward: 0.0,
@@ -157,7 +187,9 @@ impl Running {
         self.world.observe(&mut self.observation);
         self.builder.step(&self.actions, step.reward, step.shaping, &self.observation);
         self.previous_reward = step.reward;
-        step.end.map(|end| (end, step.won))
+        self.steps += 1;
+        let cut_off = self.time_limit.is_some_and(|limit| self.steps >= limit);
+        step.end.map(|end| (if cut_off { End::Truncated } else { end }, step.won))
     }
 }
 
@@ -226,6 +258,15 @@ mod tests {
         assert!(episodes.iter().any(|episode| episode.won) && episodes.iter().any(|episode| !episode.won));
         let unpermuted = rollout(5, false).roll(&mut Fixed([0, 2]), &jobs);
         assert!(unpermuted.iter().all(|episode| episode.won && episode.end == End::Terminated));
+    }
+
+    #[test]
+    fn an_end_at_the_time_limit_can_count_as_a_cut() {
+        let end = |bootstraps| {
+            let mut rollout = rollout(1, true).with_time_limit_bootstraps(bootstraps);
+            rollout.roll(&mut Fixed([0, 0]), &jobs(0..1))[0].end
+        };
+        assert_eq!((end(false), end(true)), (End::Terminated, End::Truncated));
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! ε-greedy exploration of one running episode.
+//! The randomness in the choices of one running episode: ε-greedy exploration, or sampling from the policy.
 
 use crate::{Action, Rng};
 use rand::RngExt as _;
@@ -14,13 +14,26 @@ pub struct Exploration {
     rng: Rng,
     /// Each agent's last random action.
     last: Vec<Option<Action>>,
+    /// Whether actions are sampled from the policy instead.
+    samples: bool,
 }
 
 impl Exploration {
     /// Of an episode with `n_agents`, from its own stream. Both numbers are probabilities; without
     /// `persistence` the random actions are independent, as in the paper.
     pub fn new(epsilon: f32, persistence: f32, n_agents: usize, rng: Rng) -> Self {
-        Self { epsilon, persistence, rng, last: vec![None; n_agents] }
+        Self { epsilon, persistence, rng, last: vec![None; n_agents], samples: false }
+    }
+
+    /// Of an episode whose actions are sampled from the policy, for policies that have probabilities.
+    pub fn sampling(rng: Rng) -> Self {
+        Self { samples: true, ..Self::new(0.0, 0.0, 0, rng) }
+    }
+
+    /// A number in [0, 1) that says which action of its policy an agent takes, where actions are sampled; to be asked
+    /// once for each agent and step, in the agents' order. Nothing is drawn where they are not.
+    pub fn sample(&mut self) -> Option<f32> {
+        self.samples.then(|| self.rng.random())
     }
 
     /// A random action for the agent of this row, if it is to explore on this step; to be asked once a step.
@@ -86,6 +99,23 @@ mod tests {
         assert_share(count(Some(0)), 0.15);
         assert_share(count(Some(2)), 0.15);
         assert_eq!(count(Some(1)), 0);
+    }
+
+    #[test]
+    fn numbers_to_sample_by_come_where_actions_are_sampled() {
+        let rng = || RunSeed(0).stream(Stream::Exploration, 0);
+        let mut sampling = Exploration::sampling(rng());
+        let mut count = 0;
+        for _ in 0..STEPS {
+            let u = sampling.sample().unwrap();
+            assert!((0.0..1.0).contains(&u));
+            count += usize::from(u < 0.3);
+        }
+        assert_share(count, 0.3);
+        let mut greedy = Exploration::new(0.0, 0.0, 1, rng());
+        assert_eq!(greedy.sample(), None);
+        // Nothing was drawn for it.
+        assert_eq!(greedy.rng, rng());
     }
 
     #[test]
