@@ -1,4 +1,8 @@
 //! What learning is made of, as pure functions of numbers: each with a table by hand as its test.
 
 pub mod dissimilarity;
+pub mod gae;
+pub mod ppo;
 pub mod roles;
+pub mod value_loss;
+pub mod value_norm;

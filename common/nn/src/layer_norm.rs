@@ -36,8 +36,7 @@ impl LayerNorm {
         normalize(x, &params[self.weight.clone()], &params[self.bias.clone()], y, moments);
     }
 
-    /// Takes `dy` (rows, dim), what forward read, and the moments it wrote. Adds to the parameters' gradients and
-    /// writes `dx` (rows, dim) where asked for.
+    /// Both of the following.
     pub fn backward(
         &self,
         params: &[f32],
@@ -47,12 +46,29 @@ impl LayerNorm {
         dx: Option<ViewMut<'_>>,
         grads: &mut [f32],
     ) {
+        self.backward_params(x, moments, dy, grads);
+        if let Some(dx) = dx {
+            self.backward_input(params, x, moments, dy, dx);
+        }
+    }
+
+    /// Adds to the parameters' gradients. Takes what forward read, the moments it wrote, and `dy` (rows, dim).
+    pub fn backward_params(&self, x: View<'_>, moments: &[f32], dy: View<'_>, grads: &mut [f32]) {
         // The weight and the bias lie side by side.
         let (d_weight, d_bias) = grads[self.weight.start..self.bias.end].split_at_mut(self.dim());
         gradients(x, moments, dy, d_weight, d_bias);
-        if let Some(dx) = dx {
-            normalize_backward(x, &params[self.weight.clone()], moments, dy, dx);
-        }
+    }
+
+    /// Writes `dx` (rows, dim), from the same.
+    pub fn backward_input(
+        &self,
+        params: &[f32],
+        x: View<'_>,
+        moments: &[f32],
+        dy: View<'_>,
+        dx: ViewMut<'_>,
+    ) {
+        normalize_backward(x, &params[self.weight.clone()], moments, dy, dx);
     }
 }
 

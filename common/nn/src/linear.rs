@@ -20,6 +20,13 @@ impl Linear {
         Self::side_by_side(layout, inputs, &[(name, outputs)])
     }
 
+    /// Declares `{name}.weight` alone: y = x Wᵀ, for [products](crate::tape::Tape::product_of).
+    pub fn without_bias(layout: &mut LayoutBuilder, name: &str, inputs: usize, outputs: usize) -> Self {
+        let bound = 1.0 / (inputs as f32).sqrt();
+        let weight = layout.add(format!("{name}.weight"), &[outputs, inputs], bound);
+        Self { bias: weight.end..weight.end, weight, inputs, outputs }
+    }
+
     /// Declares several layers over one input. Their weights lie together, then their biases, so that one
     /// product computes them all; their outputs stand side by side in the order given.
     pub fn side_by_side(layout: &mut LayoutBuilder, inputs: usize, layers: &[(&str, usize)]) -> Self {

@@ -61,13 +61,16 @@
 //! - Test it: [`gradcheck::run_operation`](crate::gradcheck::run_operation) gives its values,
 //!   [`gradcheck::check_operation`](crate::gradcheck::check_operation) compares its gradients with numeric ones.
 
+mod add;
 mod attention;
 mod backward;
 mod detach;
 mod gaussian;
+mod gelu;
 mod generated;
 mod gru;
 mod hidden_token;
+mod layer_norm;
 mod leaky_relu;
 mod linear;
 mod members;
