@@ -6,6 +6,7 @@
 //! - [`Rit`]: RIT's parts and the layout of its parameters; [`RitConfig`] says which parts it has.
 //! - [`encoder`], [`utility`], [`decoder`], [`task_encoder`], [`mixer`], [`contrastive`]: the parts, each
 //!   forward with its backward below it.
+//! - [`on_policy`]: proximal policy optimisation, for [`Mappo`] and [`Mat`].
 //! - [`Update`]: one training step, from a batch of episodes to new weights.
 //! - [`RitActing`]: the same networks choosing joint actions, one row after another.
 
@@ -15,11 +16,13 @@ pub mod contrastive;
 pub mod decoder;
 pub mod encoder;
 pub mod estimators;
+pub mod flat;
 pub mod learner;
 pub mod method;
 mod methods;
 pub mod mixer;
 mod model;
+pub mod on_policy;
 mod rit;
 mod rows;
 pub mod task_encoder;
@@ -31,7 +34,11 @@ pub use acting::RitActing;
 pub use config::{ConfigError, ModelConfig};
 pub use learner::Learner;
 pub use method::{Method, Regime};
-pub use methods::{Acting, learner};
+pub use methods::{
+    Acting, learner,
+    mappo::{Mappo, MappoActing, MappoConfig},
+    mat::{Mat, MatActing, MatConfig},
+};
 pub use model::Model;
 pub use rit::{Mixing, Networks, Rit, RitConfig, TaskRepresentations};
 pub use rows::{Rows, Step, TerminalStates};

@@ -1,5 +1,7 @@
 //! The methods, each in a file of its own, and the one place that tells them apart.
 
+pub mod mappo;
+pub mod mat;
 mod rit;
 
 use crate::{Learner, Model, RitActing, UpdateConfig, model::Network};

@@ -4,11 +4,14 @@
 //! case's own `case.json`. The references were computed in float64 and stored as f32.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "helpers of tests are tests too")]
 
+#[path = "golden/on_policy.rs"]
+mod on_policy;
+
 use rit_algo::{
     Losses, Mixing, Rit, RitConfig, Seen, TaskRepresentations, TerminalStates, Update, UpdateConfig,
 };
 use rit_episode::{End, Episode, decision_order};
-use rit_nn::{Optimizer, OptimizerKind, optimizer};
+use rit_nn::{Layout, Optimizer, OptimizerKind, optimizer};
 use safetensors::SafeTensors;
 use serde::Deserialize;
 use std::{
@@ -17,6 +20,12 @@ use std::{
     path::{Path, PathBuf},
     sync::{Arc, Mutex},
 };
+
+/// Which algorithm a case is of: RIT where it does not say.
+#[derive(Deserialize)]
+struct Algorithm {
+    algorithm: Option<String>,
+}
 
 #[derive(Deserialize)]
 struct Case {
@@ -49,6 +58,19 @@ enum OptimizerConfig {
     Adam { lr: f32, eps: f32, betas: Option<[f32; 2]> },
 }
 
+impl OptimizerConfig {
+    /// Which optimiser, and its learning rate.
+    fn kind(&self) -> (OptimizerKind, f32) {
+        match *self {
+            Self::RmsProp { lr, eps, alpha } => (OptimizerKind::RmsProp { alpha, eps }, lr),
+            Self::Adam { lr, eps, betas } => {
+                let [beta1, beta2] = betas.unwrap_or([0.9, 0.999]);
+                (OptimizerKind::Adam { beta1, beta2, eps }, lr)
+            }
+        }
+    }
+}
+
 #[derive(Deserialize)]
 struct Scalars {
     td_loss: f64,
@@ -74,7 +96,13 @@ fn every_case_agrees_with_the_reference() {
         {
             let case = format!("{}, {shards} shards, terminal states {terminal_states:?}", folder.display());
             let mut report = Report { case, differences: vec![] };
-            compare(folder, shards, terminal_states, &mut report);
+            let bytes = fs::read(folder.join("case.json")).unwrap();
+            match serde_json::from_slice::<Algorithm>(&bytes).unwrap().algorithm.as_deref() {
+                Some(algorithm @ ("mappo" | "mat")) => {
+                    on_policy::compare(folder, algorithm, shards, terminal_states, &mut report);
+                }
+                _ => compare(folder, shards, terminal_states, &mut report),
+            }
             println!("{}: {} differences", report.case, report.differences.len());
             differences.extend(report.differences);
         }
@@ -103,13 +131,7 @@ fn compare(folder: &Path, shards: usize, terminal_states: TerminalStates, report
         },
     });
     let rit = Arc::new(rit.unwrap());
-    let (kind, lr) = match case.optimizer {
-        OptimizerConfig::RmsProp { lr, eps, alpha } => (OptimizerKind::RmsProp { alpha, eps }, lr),
-        OptimizerConfig::Adam { lr, eps, betas } => {
-            let [beta1, beta2] = betas.unwrap_or([0.9, 0.999]);
-            (OptimizerKind::Adam { beta1, beta2, eps }, lr)
-        }
-    };
+    let (kind, lr) = case.optimizer.kind();
     let config = UpdateConfig {
         gamma: case.gamma,
         lr,
@@ -119,13 +141,12 @@ fn compare(folder: &Path, shards: usize, terminal_states: TerminalStates, report
         threads: 2,
         terminal_states,
     };
-    let weights = flat(&rit, &read("weights"), 0..rit.layout.len());
+    let weights = flat(&rit.layout, &read("weights"), 0..rit.layout.len());
     let mut update = Update::new(Arc::clone(&rit), config, weights.clone()).unwrap();
-    update.target = flat(&rit, &read("target_weights"), rit.target());
+    update.target = flat(&rit.layout, &read("target_weights"), rit.target());
 
-    let cells = Cells::read(&batch, sizes);
-    let episodes: Vec<Episode> =
-        (0..cells.episodes()).map(|index| cells.episode(&batch, sizes, index)).collect();
+    let cells = Cells::read(&batch, sizes.padding());
+    let episodes: Vec<Episode> = (0..cells.episodes()).map(|index| cells.episode(&batch, index)).collect();
     let pairing: Vec<usize> = batch.i32("pairing").iter().map(|&row| row as usize).collect();
     let said = Mutex::new(HashMap::new());
     let losses = update.gradients_seen(
@@ -150,7 +171,7 @@ fn compare(folder: &Path, shards: usize, terminal_states: TerminalStates, report
     }
 
     // The optimiser, fed with the stored gradients.
-    let stored = flat(&rit, &gradients, 0..rit.layout.len());
+    let stored = flat(&rit.layout, &gradients, 0..rit.layout.len());
     let scale = optimizer::clip_scale(optimizer::sum_of_squares(&stored).sqrt(), case.grad_norm_clip);
     let mut stepped = weights;
     Optimizer::new(kind, lr, stepped.len()).step(&mut stepped, &stored, scale);
@@ -248,8 +269,29 @@ fn compare_networks(
     }
 }
 
+impl Sizes {
+    fn padding(&self) -> Padding {
+        Padding {
+            entity_dim: self.entity_dim,
+            n_actions: self.n_actions,
+            agents_max: self.agents_max,
+            entities_max: self.entities_max,
+        }
+    }
+}
+
+/// Sizes of a padded batch.
+#[derive(Clone, Copy)]
+struct Padding {
+    entity_dim: usize,
+    n_actions: usize,
+    agents_max: usize,
+    entities_max: usize,
+}
+
 /// Which cells of the padded batch are real.
 struct Cells {
+    padding: Padding,
     steps_max: usize,
     /// Filled steps of each episode.
     steps: Vec<usize>,
@@ -259,9 +301,9 @@ struct Cells {
 }
 
 impl Cells {
-    fn read(batch: &Tensors, sizes: &Sizes) -> Self {
+    fn read(batch: &Tensors, padding: Padding) -> Self {
         let (filled, present) = (batch.f32("filled"), batch.f32("present"));
-        let episodes = present.len() / sizes.entities_max;
+        let episodes = present.len() / padding.entities_max;
         let steps_max = filled.len() / episodes;
         let steps = filled.chunks(steps_max).map(|filled| {
             let steps = filled.iter().filter(|&&filled| filled == 1.0).count();
@@ -269,12 +311,13 @@ impl Cells {
             steps
         });
         let real = |present: &[f32], rows: usize| (0..rows).filter(|&row| present[row] == 1.0).collect();
-        let present = || present.chunks(sizes.entities_max);
+        let present = || present.chunks(padding.entities_max);
         Self {
+            padding,
             steps_max,
             steps: steps.collect(),
-            agents: present().map(|present| real(present, sizes.agents_max)).collect(),
-            entities: present().map(|present| real(present, sizes.entities_max)).collect(),
+            agents: present().map(|present| real(present, padding.agents_max)).collect(),
+            entities: present().map(|present| real(present, padding.entities_max)).collect(),
         }
     }
 
@@ -283,9 +326,8 @@ impl Cells {
     }
 
     /// The real rows of one episode.
-    fn episode(&self, batch: &Tensors, sizes: &Sizes, index: usize) -> Episode {
-        let (d, a) = (sizes.entity_dim, sizes.n_actions);
-        let (n_max, m_max) = (sizes.agents_max, sizes.entities_max);
+    fn episode(&self, batch: &Tensors, index: usize) -> Episode {
+        let Padding { entity_dim: d, n_actions: a, agents_max: n_max, entities_max: m_max } = self.padding;
         let (agents, others, steps) = (&self.agents[index], &self.entities[index], self.steps[index]);
         let state = |time: usize| index * (self.steps_max + 1) + time;
         let (entities, observable, available) =
@@ -332,9 +374,9 @@ impl Cells {
 }
 
 /// Parameters by name, in the layout's order.
-fn flat(rit: &Rit, tensors: &Tensors, range: std::ops::Range<usize>) -> Vec<f32> {
+fn flat(layout: &Layout, tensors: &Tensors, range: std::ops::Range<usize>) -> Vec<f32> {
     let mut flat = Vec::new();
-    for param in rit.layout.params().iter().filter(|param| param.range.end <= range.end) {
+    for param in layout.params().iter().filter(|param| param.range.end <= range.end) {
         let values = tensors.f32(&param.name);
         assert_eq!(values.len(), param.range.len(), "{}", param.name);
         flat.extend(values);
@@ -361,6 +403,7 @@ impl Tensors {
     }
 }
 
+/// What was compared, and where it differed.
 struct Report {
     case: String,
     differences: Vec<String>,
@@ -375,6 +418,14 @@ impl Report {
     /// |a − b| ≤ 5e-4 · max|b| + 1e-6.
     fn gradients(&mut self, name: &str, ours: &[f32], theirs: &[f32]) {
         self.within(5e-4, name, ours, theirs);
+    }
+
+    /// a = b.
+    fn equal(&mut self, name: &str, ours: &[f32], theirs: &[f32]) {
+        assert!(!ours.is_empty(), "{}: {name} compares nothing", self.case);
+        if ours != theirs {
+            self.differences.push(format!("{}: {name}: {ours:?} and not {theirs:?}", self.case));
+        }
     }
 
     fn within(&mut self, relative: f32, name: &str, ours: &[f32], theirs: &[f32]) {

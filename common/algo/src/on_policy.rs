@@ -1,0 +1,342 @@
+//! Proximal policy optimisation over batches that the present weights rolled: MAPPO and MAT under training.
+//!
+//! An update has two parts. Once per batch the networks say what they thought when they acted, and advantages, value
+//! targets and the value normaliser follow ([`targets`]). Then come `epochs` × `minibatches` optimiser steps
+//! on the clipped losses ([`loss`]). Between batches nothing is kept but weights, moments and the normaliser.
+
+mod loss;
+mod targets;
+
+pub use loss::Sums;
+pub use targets::{Said, Targets};
+
+use crate::{Rows, TerminalStates, decoder::best, estimators::value_norm::ValueNorm};
+use loss::Counts;
+use rand::{Rng, seq::SliceRandom as _};
+use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder, prelude::*};
+use rit_episode::{Action, Episode, Exploration};
+use rit_nn::{
+    Layout, Optimizer, OptimizerKind,
+    attention::Group,
+    categorical, optimizer,
+    tape::{Stock, Tape, Var},
+};
+use std::{ops::Range, sync::Arc};
+
+/// An actor-critic's networks: all that this objective knows of a method.
+pub trait ActorCritic: Send + Sync {
+    /// Names and shapes of all parameters.
+    fn layout(&self) -> &Layout;
+
+    /// The parameters that acting needs.
+    fn acting(&self) -> Range<usize>;
+
+    /// The parts of the parameters whose gradients are clipped each by its own norm.
+    fn clipped_apart(&self) -> Vec<Range<usize>>;
+
+    /// A.
+    fn n_actions(&self) -> usize;
+
+    /// What a value belongs to.
+    fn value_rows(&self) -> ValueRows;
+
+    /// Makes what [`ActorCritic::forward`] reads from `inputs.rows`.
+    fn fill(&self, inputs: &mut Inputs);
+
+    /// Logits and values of all rows, given the actions taken.
+    fn forward<'a>(&self, tape: &mut Tape<'a>, inputs: &'a Inputs) -> Outputs;
+}
+
+/// What a value belongs to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ValueRows {
+    /// A state: one value for the team.
+    States,
+    /// An agent in a state.
+    Agents,
+}
+
+/// What the networks read. Each fills what it has a use for.
+#[derive(Debug, Default)]
+pub struct Inputs {
+    /// The states.
+    pub rows: Rows,
+    /// What each agent sees, `[R, m d]`.
+    pub observations: Vec<f32>,
+    /// What there is, `[groups, m d]`.
+    pub states: Vec<f32>,
+    /// Each group's agent rows, as queries and as keys.
+    pub teams: Vec<Group>,
+    /// Which tokens each agent's choice is given: the groups' `[n, n]`.
+    pub before: Vec<u8>,
+    /// Each agent row's token: 0 for the first to choose, then the action of the one before, plus 1.
+    pub tokens: Vec<usize>,
+    /// The tokens' one-hots, `[A + 1, A + 1]`.
+    pub one_hots: Vec<f32>,
+}
+
+/// What the networks say.
+#[derive(Clone, Copy, Debug)]
+pub struct Outputs {
+    /// (R, A).
+    pub logits: Var,
+    /// In normalised units: (groups, 1) or (R, 1), see [`ValueRows`].
+    pub values: Var,
+}
+
+/// Constants of the update.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PpoConfig {
+    /// γ.
+    pub gamma: f64,
+    /// λ of the advantages.
+    pub gae_lambda: f64,
+    /// c: how far a probability ratio, or a value, may go.
+    pub clip: f64,
+    /// Weight of the entropy.
+    pub entropy_coef: f64,
+    /// Weight of the value loss.
+    pub value_coef: f64,
+    /// Where the value loss becomes linear.
+    pub huber_delta: f64,
+    /// Passes over a batch.
+    pub epochs: usize,
+    /// Parts of a batch, an optimiser step each.
+    pub minibatches: usize,
+    /// How much of the value normaliser's old averages stays after a batch.
+    pub value_norm_beta: f64,
+    /// Learning rate.
+    pub lr: f32,
+    /// Which optimiser.
+    pub optimizer: OptimizerKind,
+    /// Gradients are scaled down to this norm.
+    pub grad_norm_clip: f64,
+    /// Parts a minibatch is cut into; at least 1. Part of the result.
+    pub shards: usize,
+    /// Threads that work on them; at least 1. Not part of the result.
+    pub threads: usize,
+    /// Whether states that no target needs are worked on. Not part of the result.
+    pub terminal_states: TerminalStates,
+}
+
+/// Weights under training, with everything an update needs.
+pub struct Ppo<N> {
+    network: Arc<N>,
+    config: PpoConfig,
+    pool: ThreadPool,
+    /// All parameters.
+    pub params: Vec<f32>,
+    /// The optimiser and its moments.
+    pub optimizer: Optimizer,
+    /// In whose units the values are.
+    pub value_norm: ValueNorm,
+    grads: Vec<f32>,
+    shards: Vec<Shard>,
+}
+
+/// What one optimiser step saw.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Losses {
+    /// Means over the minibatch.
+    pub sums: Sums,
+    /// policy_loss − entropy_coef · entropy + value_coef · value_loss.
+    pub loss: f64,
+    /// Norms of the gradients that are clipped apart, before clipping.
+    pub grad_norms: Vec<f64>,
+}
+
+/// A part of a minibatch.
+#[derive(Default)]
+struct Shard {
+    inputs: Inputs,
+    stock: Stock,
+    grads: Vec<f32>,
+    loss: loss::Buffers,
+}
+
+impl<N: ActorCritic> Ppo<N> {
+    /// Training from these parameters on.
+    ///
+    /// # Errors
+    /// When the threads cannot be started.
+    ///
+    /// # Panics
+    /// When `params` is not of the layout's length.
+    pub fn new(network: Arc<N>, config: PpoConfig, params: Vec<f32>) -> Result<Self, ThreadPoolBuildError> {
+        assert_eq!(params.len(), network.layout().len(), "parameters of the layout's length");
+        let pool = ThreadPoolBuilder::new()
+            .num_threads(config.threads.max(1))
+            .thread_name(|index| format!("update-{index}"))
+            .build()?;
+        Ok(Self {
+            optimizer: Optimizer::new(config.optimizer, config.lr, params.len()),
+            value_norm: ValueNorm::default(),
+            grads: vec![0.0; params.len()],
+            shards: (0..config.shards.max(1)).map(|_| Shard::default()).collect(),
+            network,
+            config,
+            pool,
+            params,
+        })
+    }
+
+    /// One update on a batch: `stream(epoch)` draws the order in which that epoch's minibatches take the episodes. Returns
+    /// what each optimiser step saw. The first that is not finite is the last, and is not taken: `params`, optimiser and
+    /// normaliser are then as they were before it, in the midst of the update.
+    pub fn update<R: Rng>(&mut self, batch: &[&Episode], stream: impl Fn(u64) -> R) -> Vec<Losses> {
+        let said = self.said(batch);
+        let targets = self.targets(batch, said);
+        let mut all = Vec::with_capacity(self.config.epochs * self.config.minibatches);
+        let mut order: Vec<usize> = (0..batch.len()).collect();
+        for epoch in 0..self.config.epochs {
+            if self.config.minibatches > 1 {
+                order.sort_unstable();
+                order.shuffle(&mut stream(epoch as u64));
+            }
+            for minibatch in 0..self.config.minibatches {
+                let losses = self.gradients(batch, &targets, self.minibatch(&order, minibatch));
+                let finite = losses.is_finite();
+                all.push(losses);
+                if !finite {
+                    return all;
+                }
+                self.step(all[all.len() - 1].grad_norms.clone());
+            }
+        }
+        all
+    }
+
+    /// The episodes of a minibatch: a slice of the epoch's order.
+    fn minibatch<'o>(&self, order: &'o [usize], minibatch: usize) -> &'o [usize] {
+        let bound = |index: usize| index * order.len() / self.config.minibatches;
+        &order[bound(minibatch)..bound(minibatch + 1)]
+    }
+
+    /// What the networks say about each episode of a batch with the present weights.
+    pub fn said(&mut self, batch: &[&Episode]) -> Vec<Said> {
+        let Self { network, config, pool, params, shards, .. } = self;
+        let (network, params) = (&**network, &params[..]);
+        let share = share(batch.len(), shards.len());
+        let parts = pool.install(|| {
+            let parts = shards.par_iter_mut().zip(batch.par_chunks(share)).map(|(shard, episodes)| {
+                shard.fill(network, episodes, config.terminal_states);
+                shard.said(network, params, episodes)
+            });
+            parts.collect::<Vec<_>>()
+        });
+        parts.into_iter().flatten().collect()
+    }
+
+    /// What the losses of a batch compare with, and the value normaliser after it.
+    pub fn targets(&mut self, batch: &[&Episode], said: Vec<Said>) -> Vec<Targets> {
+        let Self { network, config, value_norm, .. } = self;
+        targets::of_batch(batch, said, network.n_actions(), config, value_norm)
+    }
+
+    /// Losses and gradients of these episodes of a batch, without a step.
+    pub fn gradients(&mut self, batch: &[&Episode], targets: &[Targets], episodes: &[usize]) -> Losses {
+        let Self { network, config, pool, params, grads, shards, .. } = self;
+        let (network, params) = (&**network, &params[..]);
+        let counts = Counts::of(episodes.iter().map(|&episode| &targets[episode]));
+        let share = share(episodes.len(), shards.len());
+        pool.install(|| {
+            shards.par_iter_mut().enumerate().for_each(|(index, shard)| {
+                let part = |at: usize| (at * share).min(episodes.len());
+                let part = &episodes[part(index)..part(index + 1)];
+                let of_part: Vec<&Episode> = part.iter().map(|&episode| batch[episode]).collect();
+                let targets: Vec<&Targets> = part.iter().map(|&episode| &targets[episode]).collect();
+                shard.fill(network, &of_part, config.terminal_states);
+                shard.gradients(network, params, &targets, config, counts);
+            });
+        });
+        let mut losses = Losses::default();
+        grads.fill(0.0);
+        for shard in shards.iter() {
+            grads.iter_mut().zip(&shard.grads).for_each(|(sum, part)| *sum += part);
+            losses.sums.add(&shard.loss.sums);
+        }
+        losses.sums.divide(counts);
+        let Sums { policy_loss, entropy, value_loss, .. } = losses.sums;
+        losses.loss = policy_loss - config.entropy_coef * entropy + config.value_coef * value_loss;
+        let norm = |part: Range<usize>| optimizer::sum_of_squares(&grads[part]).sqrt();
+        losses.grad_norms = network.clipped_apart().into_iter().map(norm).collect();
+        losses
+    }
+
+    /// The gradients that [`Ppo::gradients`] left, in the layout's order.
+    pub fn grads(&self) -> &[f32] {
+        &self.grads
+    }
+
+    /// Clips the gradients and takes a step along them.
+    fn step(&mut self, grad_norms: Vec<f64>) {
+        for (part, norm) in self.network.clipped_apart().into_iter().zip(grad_norms) {
+            let scale = optimizer::clip_scale(norm, self.config.grad_norm_clip);
+            self.grads[part].iter_mut().for_each(|grad| *grad *= scale);
+        }
+        self.optimizer.step(&mut self.params, &self.grads, 1.0);
+    }
+}
+
+impl Losses {
+    fn is_finite(&self) -> bool {
+        self.loss.is_finite() && self.grad_norms.iter().all(|norm| norm.is_finite())
+    }
+}
+
+/// An agent's choice: sampled where the episode's actions are, else the most likely action; by its logits.
+pub fn choose(logits: &[f32], available: &[u8], exploration: &mut Exploration) -> Action {
+    match exploration.sample() {
+        Some(u) => categorical::sample(logits, available, u),
+        None => best(logits, available),
+    }
+}
+
+/// Episodes of a shard: all but the last have as many.
+fn share(episodes: usize, shards: usize) -> usize {
+    episodes.div_ceil(shards).max(1)
+}
+
+impl Shard {
+    fn fill(&mut self, network: &impl ActorCritic, episodes: &[&Episode], terminal_states: TerminalStates) {
+        self.inputs.rows.fill_from_episodes(episodes, terminal_states);
+        network.fill(&mut self.inputs);
+    }
+
+    fn said(&mut self, network: &impl ActorCritic, params: &[f32], episodes: &[&Episode]) -> Vec<Said> {
+        let mut tape = Tape::inference(params, std::mem::take(&mut self.stock));
+        let Outputs { logits, values } = network.forward(&mut tape, &self.inputs);
+        let (rows, values) = (&self.inputs.rows, tape.slice(values));
+        self.loss.distribution(rows, tape.view(logits));
+        let said = targets::said(episodes, rows, network.value_rows(), tape.view(logits), values, &self.loss);
+        self.stock = tape.into_stock();
+        said
+    }
+
+    /// Losses and gradients of what [`Shard::fill`] laid out.
+    fn gradients(
+        &mut self,
+        network: &impl ActorCritic,
+        params: &[f32],
+        targets: &[&Targets],
+        config: &PpoConfig,
+        counts: Counts,
+    ) {
+        self.grads.clear();
+        self.grads.resize(params.len(), 0.0);
+        self.loss.sums = Sums::default();
+        if self.inputs.rows.groups.is_empty() {
+            return;
+        }
+        let mut tape = Tape::recording(params, std::mem::take(&mut self.stock));
+        let Outputs { logits, values } = network.forward(&mut tape, &self.inputs);
+        let rows = &self.inputs.rows;
+        self.loss.distribution(rows, tape.view(logits));
+        self.loss.policy(rows, targets, config, counts);
+        self.loss.value(rows, network.value_rows(), tape.slice(values), targets, config, counts);
+        tape.seed(logits, self.loss.d_logits());
+        tape.seed(values, self.loss.d_values());
+        tape.backward(&mut self.grads);
+        self.stock = tape.into_stock();
+    }
+}
