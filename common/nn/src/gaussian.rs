@@ -1,39 +1,45 @@
 //! Diagonal normal distributions, one dimension at a time: log-density, entropy, divergence, each with its gradients.
-//!
-//! Logarithms are libm's: the same on every machine.
+
+use crate::math;
 
 /// ln 2π.
 const LN_TAU: f32 = 1.837_877_1;
 
 /// ln N(x; mean, variance).
+#[inline(always)]
 pub fn log_density(x: f32, mean: f32, variance: f32) -> f32 {
     let away = x - mean;
-    -0.5 * (LN_TAU + libm::logf(variance) + away * away / variance)
+    -0.5 * (LN_TAU + math::ln(variance) + away * away / variance)
 }
 
 /// Gradients of [`log_density`] by x, mean and variance.
+#[inline(always)]
 pub fn log_density_gradients(x: f32, mean: f32, variance: f32) -> [f32; 3] {
     let away = (x - mean) / variance;
     [-away, away, 0.5 * (away * away - 1.0 / variance)]
 }
 
 /// H(N(·, variance)) = ½ ln(2πe · variance).
+#[inline(always)]
 pub fn entropy(variance: f32) -> f32 {
-    0.5 * (1.0 + LN_TAU + libm::logf(variance))
+    0.5 * (1.0 + LN_TAU + math::ln(variance))
 }
 
 /// dH/dvariance.
+#[inline(always)]
 pub fn entropy_gradient(variance: f32) -> f32 {
     0.5 / variance
 }
 
 /// KL(N(mean, variance) ‖ N(to.0, to.1)) = ½ [ln(variance′ / variance) + (variance + (mean − mean′)²) / variance′ − 1].
+#[inline(always)]
 pub fn divergence(mean: f32, variance: f32, to: (f32, f32)) -> f32 {
     let away = mean - to.0;
-    0.5 * (libm::logf(to.1 / variance) + (variance + away * away) / to.1 - 1.0)
+    0.5 * (math::ln(to.1 / variance) + (variance + away * away) / to.1 - 1.0)
 }
 
 /// Gradients of [`divergence`] by mean, variance, mean′ and variance′.
+#[inline(always)]
 pub fn divergence_gradients(mean: f32, variance: f32, to: (f32, f32)) -> [f32; 4] {
     let away = mean - to.0;
     let d_mean = away / to.1;

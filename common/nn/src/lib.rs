@@ -23,6 +23,7 @@ pub mod math;
 pub mod matmul;
 pub mod optimizer;
 pub mod post_norm;
+pub mod random;
 mod scratch;
 pub mod tape;
 mod view;

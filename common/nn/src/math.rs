@@ -87,6 +87,40 @@ pub fn exp(x: f32) -> f32 {
     p * f32::from_bits(((exponent + 127) << 23) as u32)
 }
 
+/// ln x with an error of about 1e-7, relative or absolute, for positive normal x.
+#[inline(always)]
+pub fn ln(x: f32) -> f32 {
+    // x = 2^n m with m in [√½, √2): its bits less those of √½ have n where an exponent is.
+    let bits = x.to_bits() as i32 - std::f32::consts::FRAC_1_SQRT_2.to_bits() as i32;
+    let n = (bits >> 23) as f32;
+    let m = f32::from_bits(((bits & 0x7f_ffff) + std::f32::consts::FRAC_1_SQRT_2.to_bits() as i32) as u32);
+    // ln (1 + r) = r − r²/2 + r³ P(r), P fitted (Cephes).
+    let r = m - 1.0;
+    let rr = r * r;
+    let p = 7.037_683_6e-2_f32.mul_add(r, -1.151_461e-1);
+    let p = p.mul_add(r, 1.167_699_9e-1).mul_add(r, -1.242_014_1e-1).mul_add(r, 1.424_932_3e-1);
+    let p = p.mul_add(r, -1.666_805_8e-1).mul_add(r, 2.000_071_5e-1).mul_add(r, -2.499_999_4e-1);
+    let p = p.mul_add(r, 3.333_333e-1) * r * rr;
+    // ln 2 in two parts, the first exact in few bits.
+    n.mul_add(0.693_359_4, r + (-0.5_f32).mul_add(rr, n.mul_add(-2.121_944_4e-4, p)))
+}
+
+/// sin 2πv and cos 2πv with an absolute error of about 1e-7, for v in [0, 1].
+#[inline(always)]
+pub fn sin_cos_of_turns(v: f32) -> (f32, f32) {
+    // v = quarter / 4 + rest, the rest within an eighth of a turn; both polynomials are Cephes's.
+    let shifted = v.mul_add(4.0, ROUND);
+    let quarter = shifted.to_bits();
+    let x = v.mul_add(4.0, ROUND - shifted) * std::f32::consts::FRAC_PI_2;
+    let xx = x * x;
+    let p = (-1.951_529_6e-4_f32).mul_add(xx, 8.332_161e-3).mul_add(xx, -1.666_665_5e-1);
+    let sin = p.mul_add(xx * x, x);
+    let p = 2.443_315_7e-5_f32.mul_add(xx, -1.388_731_6e-3).mul_add(xx, 4.166_664_6e-2);
+    let cos = p.mul_add(xx * xx, (-0.5_f32).mul_add(xx, 1.0));
+    let (s, c) = if quarter & 1 == 0 { (sin, cos) } else { (cos, sin) };
+    (if quarter & 2 == 0 { s } else { -s }, if (quarter + 1) & 2 == 0 { c } else { -c })
+}
+
 /// A softmax's e^x, x less the largest: exactly zero where it is less than 1e-20 of the largest, for x = −∞ too.
 ///
 /// So small a share counts for nothing in a sum, but its gradients are so small that their products become subnormal, and
@@ -237,6 +271,28 @@ mod tests {
         for x in [f32::MAX, f32::INFINITY, 1e9] {
             assert!(exp(x) > 1e38 && exp(-x) < 1e-37);
             assert_eq!((sigmoid(x), tanh(x), tanh(-x)), (1.0, 1.0, -1.0));
+        }
+    }
+
+    #[test]
+    fn logarithms_are_close_to_the_real_ones() {
+        for step in -3000..=3000 {
+            let x = (f64::from(step) * 0.02).exp() as f32;
+            let real = f64::from(x).ln();
+            assert!((f64::from(ln(x)) - real).abs() <= 2e-7 * real.abs().max(1.0), "ln {x}");
+        }
+        assert_eq!(ln(1.0), 0.0);
+        assert!((f64::from(ln(f32::MIN_POSITIVE)) - f64::from(f32::MIN_POSITIVE).ln()).abs() < 1e-5);
+    }
+
+    #[test]
+    fn sines_and_cosines_are_close_to_the_real_ones() {
+        for step in 0..=4096 {
+            let v = step as f32 / 4096.0;
+            let (sin, cos) = sin_cos_of_turns(v);
+            let (real_sin, real_cos) = (std::f64::consts::TAU * f64::from(v)).sin_cos();
+            assert!((f64::from(sin) - real_sin).abs() < 2e-7, "sin {v}: {sin} {real_sin}");
+            assert!((f64::from(cos) - real_cos).abs() < 2e-7, "cos {v}: {cos} {real_cos}");
         }
     }
 
