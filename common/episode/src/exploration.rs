@@ -36,6 +36,11 @@ impl Exploration {
         self.samples.then(|| self.rng.random())
     }
 
+    /// The episode's stream, for what a policy itself draws while it explores; `None` with an ε of 0, in evaluation.
+    pub fn stream(&mut self) -> Option<&mut Rng> {
+        (self.epsilon > 0.0).then_some(&mut self.rng)
+    }
+
     /// A random action for the agent of this row, if it is to explore on this step; to be asked once a step.
     /// `available` has a flag for each action.
     pub fn explore(&mut self, row: usize, available: &[u8]) -> Option<Action> {
@@ -116,6 +121,14 @@ mod tests {
         assert_eq!(greedy.sample(), None);
         // Nothing was drawn for it.
         assert_eq!(greedy.rng, rng());
+    }
+
+    #[test]
+    fn a_policy_draws_only_while_it_explores() {
+        let of = |epsilon| Exploration::new(epsilon, 0.0, 1, RunSeed(0).stream(Stream::Exploration, 0));
+        assert!(of(0.0).stream().is_none());
+        let (mut one, mut other) = (of(0.05), of(1.0));
+        assert_eq!(one.stream().map(rand::Rng::next_u64), other.stream().map(rand::Rng::next_u64));
     }
 
     #[test]

@@ -27,6 +27,12 @@ pub enum Stream {
     Environment = 6,
     /// An episode's exploration; indexed by episode number.
     Exploration = 7,
+    /// Which entities REFIL imagines in one group; indexed by update.
+    ImaginedGroups = 8,
+    /// The noise in ROMA's roles, of the network under training; indexed by update.
+    RoleNoise = 9,
+    /// The same of the target network.
+    TargetRoleNoise = 10,
 }
 
 /// The seed of a run, or of one evaluation.
