@@ -91,11 +91,9 @@ impl Roller {
                     &mut acting.insert((version, Acting::new(&self.model, &params))).1
                 }
             };
-            let jobs: Vec<Job> = lease
-                .episodes
-                .iter()
-                .map(|&number| Job { number, weights_version: version, epsilon: lease.epsilon, task: None })
-                .collect();
+            let choice = self.model.method().exploring(lease.epsilon);
+            let job = |&number| Job { number, weights_version: version, choice, task: None };
+            let jobs: Vec<Job> = lease.episodes.iter().map(job).collect();
             for episode in self.rollout.roll(acting, &jobs) {
                 wire::encode(&episode, &self.layout, self.run_id, self.actor, &mut frame)?;
                 self.sink.send(&frame, &give_up)?;

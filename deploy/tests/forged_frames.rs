@@ -11,7 +11,7 @@ use rit_env::{
     rollout::{Job, Rollout},
 };
 use rit_episode::{
-    RunSeed,
+    Choice, RunSeed,
     wire::{self, Frame, PayloadLayout},
 };
 use rit_ipc::{EpisodeSender, RunSpace};
@@ -35,7 +35,7 @@ fn forged_frames_are_counted_and_never_reach_replay() {
     send(&Frame::new(&layout));
     let tasks = TaskSet::MatrixGame.tasks(Split::Training);
     let mut rollout = Rollout::new(tasks, EnvironmentOptions::default(), RunSeed(9), true);
-    let job = Job { number: 1_000_000, weights_version: 0, epsilon: 1.0, task: None };
+    let job = Job { number: 1_000_000, weights_version: 0, choice: Choice::EpsilonGreedy(1.0), task: None };
     let episode = rollout.roll(&mut Script::Random, &[job]).remove(0);
     let mut frame = Frame::new(&layout);
     wire::encode(&episode, &layout, run_dir.run_id(), 0, &mut frame).unwrap();

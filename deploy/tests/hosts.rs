@@ -11,7 +11,10 @@ use rit_env::{
     particle::Script,
     rollout::{Job, Rollout},
 };
-use rit_episode::wire::{self, Frame, PayloadLayout};
+use rit_episode::{
+    Choice,
+    wire::{self, Frame, PayloadLayout},
+};
 use rit_proto::{
     transport::{Client, CredentialFiles, Credentials, connect},
     v1::{
@@ -371,7 +374,7 @@ async fn what_comes_twice_or_is_forged_is_counted_and_not_let_in() {
     let job = Job {
         number: lease.episodes[0],
         weights_version: lease.weights_version,
-        epsilon: lease.epsilon,
+        choice: Choice::EpsilonGreedy(lease.epsilon),
         task: None,
     };
     let episode = rollout.roll(&mut Script::Random, &[job]).remove(0);

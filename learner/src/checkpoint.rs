@@ -26,7 +26,7 @@ use rit_algo::{
     Learner, Model,
     learner::{NamedState, Numbers},
 };
-use rit_config::{Algorithm, RunDir};
+use rit_config::{Algorithm, Config, RunDir};
 use rit_episode::{Episode, wire::Expected};
 use safetensors::{Dtype, SafeTensorError, SafeTensors, tensor::TensorView};
 use sha2::{Digest as _, Sha256};
@@ -214,7 +214,7 @@ impl Loaded {
     }
 }
 
-/// The newest checkpoint that is whole and of a run that this learner can go on from, with replay's last `buffer_size` episodes;
+/// The newest checkpoint that is whole and of a run that this learner can go on from, with replay's last episodes;
 /// `None` where none was ever written.
 ///
 /// # Errors
@@ -223,14 +223,14 @@ pub fn load_newest(
     run_dir: &RunDir,
     learner: &dyn Learner,
     expected: &Expected,
-    algorithm: &Algorithm,
+    config: &Config,
 ) -> Result<Option<Loaded>, CheckpointError> {
     let all = run_dir.checkpoints();
     let mut damaged = Vec::new();
     for folder in folders(&all)?.into_iter().rev() {
-        let loaded = load(&folder, learner, expected.tasks.len(), algorithm).and_then(|state| {
+        let loaded = load(&folder, learner, expected.tasks.len(), &config.algorithm).and_then(|state| {
             let end = state.manifest.progress.episodes;
-            let numbers = end.saturating_sub(algorithm.buffer_size as u64)..end;
+            let numbers = end.saturating_sub(config.replay_episodes() as u64)..end;
             let replay = replay_log::read(&run_dir.replay(), expected, numbers)?;
             Ok((state, replay))
         });
@@ -353,14 +353,14 @@ fn folders(all: &Path) -> Result<Vec<PathBuf>, CheckpointError> {
 ///
 /// # Errors
 /// When the folder cannot be read.
-pub fn replay_needed_from(run_dir: &RunDir, buffer_size: usize) -> Result<u64, CheckpointError> {
+pub fn replay_needed_from(run_dir: &RunDir, replay_episodes: usize) -> Result<u64, CheckpointError> {
     let oldest = folders(&run_dir.checkpoints())?.into_iter().next();
     let episodes = oldest.and_then(|folder| {
         let manifest: Manifest = serde_json::from_slice(&fs::read(folder.join(MANIFEST)).ok()?).ok()?;
         Some(manifest.progress.episodes)
     });
     // One that cannot be read keeps everything: another may yet be needed.
-    Ok(episodes.map_or(0, |episodes| episodes.saturating_sub(buffer_size as u64)))
+    Ok(episodes.map_or(0, |episodes| episodes.saturating_sub(replay_episodes as u64)))
 }
 
 fn sha256(bytes: &[u8]) -> String {

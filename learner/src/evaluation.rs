@@ -5,7 +5,7 @@ use rit_env::{
     Environment, EnvironmentOptions, Split, Task, TaskSet, UnknownName,
     rollout::{Job, Rollout},
 };
-use rit_episode::{Episode, Policy, RunSeed};
+use rit_episode::{Choice, Episode, Policy, RunSeed};
 use rit_proto::v1;
 use serde::{Deserialize, Serialize};
 use std::{collections::BTreeMap, ops::Range};
@@ -161,7 +161,7 @@ impl Evaluator {
 
 /// Greedy episodes of these numbers of a rollout's one task.
 fn jobs(numbers: Range<u64>) -> Vec<Job> {
-    let job = |number| Job { number, weights_version: 0, epsilon: 0.0, task: Some(0) };
+    let job = |number| Job { number, weights_version: 0, choice: Choice::Greedy, task: Some(0) };
     numbers.map(job).collect()
 }
 

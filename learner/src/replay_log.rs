@@ -273,7 +273,7 @@ mod tests {
         particle::Script,
         rollout::{Job, Rollout},
     };
-    use rit_episode::RunSeed;
+    use rit_episode::{Choice, RunSeed};
 
     const RUN: RunId = *b"a run's sixteen.";
 
@@ -289,8 +289,9 @@ mod tests {
     fn episodes(numbers: Range<u64>) -> Vec<Episode> {
         let tasks = TaskSet::MatrixGame.tasks(Split::Training);
         let mut rollout = Rollout::new(tasks, EnvironmentOptions::default(), RunSeed(3), true);
-        let jobs: Vec<Job> =
-            numbers.map(|number| Job { number, weights_version: 7, epsilon: 1.0, task: None }).collect();
+        let jobs: Vec<Job> = numbers
+            .map(|number| Job { number, weights_version: 7, choice: Choice::EpsilonGreedy(1.0), task: None })
+            .collect();
         rollout.roll(&mut Script::Random, &jobs)
     }
 

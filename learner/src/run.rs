@@ -15,7 +15,7 @@ use crate::{
     writer::Writer,
 };
 use rit_algo::{ConfigError, Learner, Model};
-use rit_config::{Algorithm, Config, RunDir, Tls};
+use rit_config::{Config, RunDir, Tls};
 use rit_env::Split;
 use rit_episode::{
     Stream,
@@ -138,13 +138,13 @@ pub async fn run(
     let news = Box::new(move |what| {
         let _ = news.blocking_send(Event::News(what));
     });
-    let loaded = load(&run_dir, &*learner, &expected, &config.algorithm)?;
+    let loaded = load(&run_dir, &*learner, &expected, &config)?;
     let episodes = loaded.as_ref().map_or(0, |loaded| loaded.state.manifest.progress.episodes);
     let writer = Writer {
         run_dir: run_dir.clone(),
         model: Arc::clone(&model),
         log: ReplayLog::open(&run_dir.replay(), expected.layout, run_dir.run_id(), episodes)?,
-        buffer_size: config.algorithm.buffer_size,
+        replay_episodes: config.replay_episodes(),
         keep: config.checkpoints.keep,
         events: events.clone(),
     };
@@ -261,9 +261,9 @@ fn load(
     run_dir: &RunDir,
     learner: &dyn Learner,
     expected: &Expected,
-    algorithm: &Algorithm,
+    config: &Config,
 ) -> Result<Option<Loaded>, LearnerError> {
-    let loaded = checkpoint::load_newest(run_dir, learner, expected, algorithm)?;
+    let loaded = checkpoint::load_newest(run_dir, learner, expected, config)?;
     if let Some(loaded) = &loaded {
         loaded.warnings().iter().for_each(|warning| tracing::warn!("{warning}"));
         let Loaded { folder, state, .. } = loaded;

@@ -14,7 +14,7 @@ use crate::{
     writer::{ToWrite, Written},
 };
 use rit_algo::{
-    Acting, Learner,
+    Acting, Learner, Regime,
     learner::{Draw, NamedState, NotFinite, StateError},
 };
 use rit_config::{Config, RunDir, Until};
@@ -126,7 +126,8 @@ pub struct Trainer {
     config: Config,
     run_dir: RunDir,
     learner: Box<dyn Learner>,
-    replay: Replay,
+    /// None where each batch is learned from once.
+    replay: Option<Replay>,
     board: Arc<WeightsBoard>,
     evaluator: Evaluator,
     metrics: MetricsFile,
@@ -179,7 +180,7 @@ impl Trainer {
         let tasks = task_set.tasks(Split::Training).iter().map(ToString::to_string).collect();
         let (metrics, tensorboard) = files(&run_dir, loaded.as_ref().map(|loaded| &loaded.state.manifest))?;
         let mut trainer = Self {
-            replay: Replay::new(config.algorithm.buffer_size),
+            replay: (learner.regime() == Regime::Replay).then(|| Replay::new(config.algorithm.buffer_size)),
             board: Arc::new(WeightsBoard::new(first, lag)),
             evaluator: Evaluator::new(&config),
             metrics,
@@ -229,7 +230,9 @@ impl Trainer {
         }
         snapshots.for_each(|snapshot| self.board.publish(snapshot));
         self.recent.restore(manifest.recent, manifest.exploring);
-        loaded.replay.into_iter().for_each(|episode| self.replay.insert(Arc::new(episode)));
+        if let Some(replay) = &mut self.replay {
+            loaded.replay.into_iter().for_each(|episode| replay.insert(Arc::new(episode)));
+        }
         let named = |(task, result): (String, TaskResult)| TaskResult { task, ..result };
         self.standing = Standing {
             progress: manifest.progress,
@@ -238,7 +241,7 @@ impl Trainer {
             evaluation: manifest
                 .evaluation
                 .map(|(at, results)| (at, results.into_iter().map(named).collect())),
-            replay_episodes: self.replay.len(),
+            replay_episodes: self.replay.as_ref().map_or(0, Replay::len),
         };
         Ok(())
     }
@@ -291,23 +294,31 @@ impl Trainer {
         self.finish()
     }
 
-    /// One batch: into replay, one update, and whatever is due. Returns whether the run is over.
+    /// One batch: into replay, where there is one, one update, and whatever is due. Returns whether the run is over.
     fn train(&mut self, episodes: Vec<Episode>) -> Result<bool, TrainError> {
         let algorithm = &self.config.algorithm;
         let progress = &mut self.standing.progress;
         self.env_steps_before = progress.env_steps;
+        let mut collected = Vec::with_capacity(episodes.len());
         for episode in episodes {
             progress.env_steps += episode.steps() as u64;
             progress.episodes += 1;
             self.recent.push(&episode, progress.updates);
             let episode = Arc::new(episode);
-            // Without a writer there is nobody to write; checkpoints say so.
-            let _ = self.writer.send(ToWrite::Episode(Arc::clone(&episode)));
-            self.replay.insert(episode);
+            if let Some(replay) = &mut self.replay {
+                // Without a writer there is nobody to write; checkpoints say so.
+                let _ = self.writer.send(ToWrite::Episode(Arc::clone(&episode)));
+                replay.insert(Arc::clone(&episode));
+            }
+            collected.push(episode);
         }
-        if self.replay.len() >= algorithm.batch_size {
-            let draw = Draw { seed: self.config.seed, update: progress.updates };
-            let batch = self.replay.sample(algorithm.batch_size, &mut draw.stream(Stream::Replay));
+        let draw = Draw { seed: self.config.seed, update: progress.updates };
+        let batch = match &self.replay {
+            Some(replay) if replay.len() < algorithm.batch_size => None,
+            Some(replay) => Some(replay.sample(algorithm.batch_size, &mut draw.stream(Stream::Replay))),
+            None => Some(collected.iter().map(|episode| &**episode).collect()),
+        };
+        if let Some(batch) = batch {
             let learned = self.learner.learn(&batch, draw);
             progress.updates += 1;
             let values =
@@ -321,7 +332,7 @@ impl Trainer {
             self.board.publish(Snapshot::new(progress.updates, progress.env_steps, acting));
         }
         let after = *progress;
-        self.standing.replay_episodes = self.replay.len();
+        self.standing.replay_episodes = self.replay.as_ref().map_or(0, Replay::len);
         self.standing.recent = self.recent.results();
         if self.is_due(self.config.learner.metrics_every_env_steps) {
             let standing = &self.standing;

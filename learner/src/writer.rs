@@ -52,8 +52,8 @@ pub struct Writer {
     pub model: Arc<Model>,
     /// Replay on disk.
     pub log: ReplayLog,
-    /// Episodes that replay holds.
-    pub buffer_size: usize,
+    /// Episodes that replay holds; 0 without.
+    pub replay_episodes: usize,
     /// Checkpoints kept.
     pub keep: usize,
     /// Who is told of checkpoints.
@@ -97,7 +97,7 @@ impl Writer {
 
     fn append(&mut self, waiting: &mut VecDeque<Arc<Episode>>) -> Result<(), CheckpointError> {
         // What replay has forgotten meanwhile is not needed on disk either.
-        let forgotten = waiting.len().saturating_sub(self.buffer_size);
+        let forgotten = waiting.len().saturating_sub(self.replay_episodes);
         waiting.drain(..forgotten);
         while let Some(episode) = waiting.front() {
             self.log.append(episode)?;
@@ -110,7 +110,7 @@ impl Writer {
         self.append(waiting)?;
         self.log.sync()?;
         let path = checkpoint::save(&self.run_dir, &self.model, state, self.keep)?;
-        self.log.forget_before(checkpoint::replay_needed_from(&self.run_dir, self.buffer_size)?)?;
+        self.log.forget_before(checkpoint::replay_needed_from(&self.run_dir, self.replay_episodes)?)?;
         Ok(path)
     }
 }

@@ -1,5 +1,6 @@
 //! The algorithms there are: their names, and the facts that set them apart.
 
+use rit_episode::Choice;
 use std::{fmt, str::FromStr};
 
 /// An algorithm: what `algorithm.name` and `--algorithm` name.
@@ -158,6 +159,14 @@ impl Method {
                 let summary = "Multi-Agent Transformer: on-policy, agents choose one after another";
                 Facts { name: "mat", summary, ordered: true, ..on_policy }
             }
+        }
+    }
+
+    /// How actions come about in training, where a random one has this probability if the method explores so.
+    pub const fn exploring(self, epsilon: f32) -> Choice {
+        match self.facts().regime {
+            Regime::Replay => Choice::EpsilonGreedy(epsilon),
+            Regime::OnPolicy => Choice::Sampled,
         }
     }
 

@@ -8,7 +8,7 @@ use rit_algo::{
     contrastive::draw_pairing,
 };
 use rit_episode::{
-    End, Episode, Exploration, Observation, Policy, Rng, RunSeed, Stream, Turn, decision_order,
+    Choice, End, Episode, Exploration, Observation, Policy, Rng, RunSeed, Stream, Turn, decision_order,
 };
 use rit_nn::{OptimizerKind, gradcheck};
 use std::{
@@ -159,7 +159,7 @@ fn replay(acting: &mut RitActing, slots: &[(usize, &Episode)]) -> Vec<Vec<f32>> 
                 (
                     observation,
                     vec![0; n],
-                    Exploration::new(0.0, 0.0, n, RunSeed(0).stream(Stream::Exploration, 0)),
+                    Exploration::new(Choice::Greedy, 0.0, n, RunSeed(0).stream(Stream::Exploration, 0)),
                 )
             })
             .collect();

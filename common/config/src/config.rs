@@ -1,7 +1,7 @@
 //! The resolved configuration: complete, and within its limits. `presets/all.toml` says what each key means.
 
 use crate::ConfigError;
-use rit_algo::{Method, ModelConfig, TerminalStates, UpdateConfig, method::Encoder};
+use rit_algo::{Method, ModelConfig, Regime, TerminalStates, UpdateConfig, method::Encoder};
 use rit_env::{EnvironmentOptions, TaskSet};
 use rit_episode::RunSeed;
 use rit_nn::OptimizerKind;
@@ -303,8 +303,19 @@ impl Config {
         EnvironmentOptions { view_radius: view_radius.is_finite().then_some(view_radius), approach_shaping }
     }
 
-    /// ε after so many collected environment steps.
+    /// Episodes that replay holds; 0 where the method learns from each batch once.
+    pub fn replay_episodes(&self) -> usize {
+        match self.model().method.facts().regime {
+            Regime::Replay => self.algorithm.buffer_size,
+            Regime::OnPolicy => 0,
+        }
+    }
+
+    /// ε after so many collected environment steps; 0 where the method samples its actions.
     pub fn epsilon(&self, env_steps: u64) -> f32 {
+        if self.model().method.facts().regime == Regime::OnPolicy {
+            return 0.0;
+        }
         let Algorithm { epsilon_start, epsilon_finish, epsilon_anneal_steps, .. } = self.algorithm;
         let progress = (env_steps as f64 / epsilon_anneal_steps.max(1) as f64).min(1.0);
         (epsilon_start + (epsilon_finish - epsilon_start) * progress) as f32

@@ -3,8 +3,8 @@
 use crate::{Environment, EnvironmentOptions, Seated, Task};
 use rand::RngExt as _;
 use rit_episode::{
-    Action, End, Episode, EpisodeBuilder, Exploration, Observation, Policy, Rng, RunSeed, Stream, Turn,
-    decision_order,
+    Action, Choice, End, Episode, EpisodeBuilder, Exploration, Observation, Policy, Rng, RunSeed, Stream,
+    Turn, decision_order,
 };
 
 /// An episode to be rolled.
@@ -14,8 +14,8 @@ pub struct Job {
     pub number: u64,
     /// The weights the policy acts with, recorded in the episode.
     pub weights_version: u64,
-    /// Probability of a random action, per agent.
-    pub epsilon: f32,
+    /// How its actions come about.
+    pub choice: Choice,
     /// Index of the task; drawn uniformly from the episode's own stream where `None`.
     pub task: Option<usize>,
 }
@@ -28,8 +28,6 @@ pub struct Rollout {
     seed: RunSeed,
     random_permutation: bool,
     exploration_persistence: f32,
-    /// Whether actions are sampled from the policy.
-    sampled: bool,
     /// Whether an episode that ends at the task's limit counts as cut off there.
     time_limit_bootstraps: bool,
     /// Worlds that wait for their next episode, by task.
@@ -72,7 +70,6 @@ impl Rollout {
             seed,
             random_permutation,
             exploration_persistence: 0.0,
-            sampled: false,
             time_limit_bootstraps: false,
             idle,
         }
@@ -81,11 +78,6 @@ impl Rollout {
     /// Explores with this probability that a random action is the agent's last random one again.
     pub fn with_exploration_persistence(self, exploration_persistence: f32) -> Self {
         Self { exploration_persistence, ..self }
-    }
-
-    /// Has actions sampled from the policy: what an on-policy method learns from. The jobs' ε has no say then.
-    pub fn sampled(self) -> Self {
-        Self { sampled: true, ..self }
     }
 
     /// Counts an episode as long as its task's limit as truncated, though the environment may call it terminated: for
@@ -148,12 +140,6 @@ impl Rollout {
         let mut observation = Observation::default();
         world.observe(&mut observation);
         policy.begin(slot, n_agents);
-        let rng = stream(Stream::Exploration);
-        let exploration = if self.sampled {
-            Exploration::sampling(rng)
-        } else {
-            Exploration::new(job.epsilon, self.exploration_persistence, n_agents, rng)
-        };
         Running {
             slot,
             task,
@@ -161,7 +147,12 @@ impl Rollout {
             steps: 0,
             world,
             environment_rng,
-            exploration,
+            exploration: Exploration::new(
+                job.choice,
+                self.exploration_persistence,
+                n_agents,
+                stream(Stream::Exploration),
+            ),
             builder: EpisodeBuilder::new(job.number, job.weights_version, task, order, &observation),
             observation,
             previous_reward: 0.0,
@@ -222,7 +213,7 @@ mod tests {
     }
 
     fn jobs(numbers: std::ops::Range<u64>) -> Vec<Job> {
-        numbers.map(|number| Job { number, weights_version: 0, epsilon: 0.0, task: None }).collect()
+        numbers.map(|number| Job { number, weights_version: 0, choice: Choice::Greedy, task: None }).collect()
     }
 
     #[test]

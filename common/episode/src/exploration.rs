@@ -1,51 +1,44 @@
-//! The randomness in the choices of one running episode: ε-greedy exploration, or sampling from the policy.
+//! How the actions of one running episode come about: greedy, ε-greedy, or drawn from the policy's distribution.
 
 use crate::{Action, Rng};
 use rand::RngExt as _;
 
-/// Which of an episode's actions are random, and what they are.
+/// How an episode's actions come about.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Choice {
+    /// The policy's best, and nothing is drawn: evaluation.
+    Greedy,
+    /// With this probability, per agent and step, a random action; else the policy's best.
+    EpsilonGreedy(f32),
+    /// Drawn from the policy's distribution over actions.
+    Sampled,
+}
+
+/// What chance adds to an episode's actions.
 #[derive(Clone, Debug)]
 pub struct Exploration {
-    /// Probability of a random action, per agent and step.
-    epsilon: f32,
+    choice: Choice,
     /// Probability that a random action is the agent's last random one again.
     persistence: f32,
     /// The episode's own stream.
     rng: Rng,
     /// Each agent's last random action.
     last: Vec<Option<Action>>,
-    /// Whether actions are sampled from the policy instead.
-    samples: bool,
 }
 
 impl Exploration {
-    /// Of an episode with `n_agents`, from its own stream. Both numbers are probabilities; without
-    /// `persistence` the random actions are independent, as in the paper.
-    pub fn new(epsilon: f32, persistence: f32, n_agents: usize, rng: Rng) -> Self {
-        Self { epsilon, persistence, rng, last: vec![None; n_agents], samples: false }
-    }
-
-    /// Of an episode whose actions are sampled from the policy, for policies that have probabilities.
-    pub fn sampling(rng: Rng) -> Self {
-        Self { samples: true, ..Self::new(0.0, 0.0, 0, rng) }
-    }
-
-    /// A number in [0, 1) that says which action of its policy an agent takes, where actions are sampled; to be asked
-    /// once for each agent and step, in the agents' order. Nothing is drawn where they are not.
-    pub fn sample(&mut self) -> Option<f32> {
-        self.samples.then(|| self.rng.random())
-    }
-
-    /// The episode's stream, for what a policy itself draws while it explores; `None` with an ε of 0, in evaluation.
-    pub fn stream(&mut self) -> Option<&mut Rng> {
-        (self.epsilon > 0.0).then_some(&mut self.rng)
+    /// Of an episode with `n_agents`, from its own stream. `persistence` is a probability; at 0 the random
+    /// actions are independent, as in the paper.
+    pub fn new(choice: Choice, persistence: f32, n_agents: usize, rng: Rng) -> Self {
+        Self { choice, persistence, rng, last: vec![None; n_agents] }
     }
 
     /// A random action for the agent of this row, if it is to explore on this step; to be asked once a step.
     /// `available` has a flag for each action.
     pub fn explore(&mut self, row: usize, available: &[u8]) -> Option<Action> {
+        let Choice::EpsilonGreedy(epsilon) = self.choice else { return None };
         // Drawn whatever ε is, so that the stream stays in step.
-        let explores = self.rng.random::<f32>() < self.epsilon;
+        let explores = self.rng.random::<f32>() < epsilon;
         explores.then(|| {
             let last = self.last[row].filter(|&last| available[usize::from(last)] != 0);
             let action = match last.filter(|_| self.persists()) {
@@ -55,6 +48,17 @@ impl Exploration {
             self.last[row] = Some(action);
             action
         })
+    }
+
+    /// A number in 0..1 to choose an action with, by the policy's distribution; to be asked once for each agent and
+    /// step, in row order. None where the best action is to be chosen.
+    pub fn sample(&mut self) -> Option<f32> {
+        (self.choice == Choice::Sampled).then(|| self.rng.random())
+    }
+
+    /// The episode's own stream, for whatever else a policy draws in training; none in evaluation.
+    pub fn stream(&mut self) -> Option<&mut Rng> {
+        (self.choice != Choice::Greedy).then_some(&mut self.rng)
     }
 
     /// Any available action, each as likely; the first where none is available.
@@ -84,7 +88,7 @@ mod tests {
     /// What one agent does on each of many steps with two of three actions available.
     fn actions(epsilon: f32, persistence: f32) -> Vec<Option<Action>> {
         let rng = RunSeed(0).stream(Stream::Exploration, 0);
-        let mut exploration = Exploration::new(epsilon, persistence, 1, rng);
+        let mut exploration = Exploration::new(Choice::EpsilonGreedy(epsilon), persistence, 1, rng);
         (0..STEPS).map(|_| exploration.explore(0, &[1, 0, 1])).collect()
     }
 
@@ -107,31 +111,6 @@ mod tests {
     }
 
     #[test]
-    fn numbers_to_sample_by_come_where_actions_are_sampled() {
-        let rng = || RunSeed(0).stream(Stream::Exploration, 0);
-        let mut sampling = Exploration::sampling(rng());
-        let mut count = 0;
-        for _ in 0..STEPS {
-            let u = sampling.sample().unwrap();
-            assert!((0.0..1.0).contains(&u));
-            count += usize::from(u < 0.3);
-        }
-        assert_share(count, 0.3);
-        let mut greedy = Exploration::new(0.0, 0.0, 1, rng());
-        assert_eq!(greedy.sample(), None);
-        // Nothing was drawn for it.
-        assert_eq!(greedy.rng, rng());
-    }
-
-    #[test]
-    fn a_policy_draws_only_while_it_explores() {
-        let of = |epsilon| Exploration::new(epsilon, 0.0, 1, RunSeed(0).stream(Stream::Exploration, 0));
-        assert!(of(0.0).stream().is_none());
-        let (mut one, mut other) = (of(0.05), of(1.0));
-        assert_eq!(one.stream().map(rand::Rng::next_u64), other.stream().map(rand::Rng::next_u64));
-    }
-
-    #[test]
     fn persistence_repeats_the_last_random_action() {
         let repeated = |persistence| {
             let actions = actions(1.0, persistence);
@@ -143,9 +122,25 @@ mod tests {
     }
 
     #[test]
+    fn only_what_is_asked_for_is_drawn() {
+        let of = |choice| Exploration::new(choice, 0.0, 1, RunSeed(0).stream(Stream::Exploration, 0));
+        let mut greedy = of(Choice::Greedy);
+        assert_eq!((greedy.explore(0, &[1]), greedy.sample()), (None, None));
+        assert!(greedy.stream().is_none());
+        let mut sampled = of(Choice::Sampled);
+        assert_eq!(sampled.explore(0, &[1]), None);
+        let mut stream = RunSeed(0).stream(Stream::Exploration, 0);
+        let expected: [f32; 2] = [stream.random(), stream.random()];
+        assert_eq!([sampled.sample(), sampled.sample()], expected.map(Some));
+        let mut explores = of(Choice::EpsilonGreedy(1.0));
+        assert_eq!((explores.explore(0, &[0, 1]), explores.sample()), (Some(1), None));
+        assert!(explores.stream().is_some());
+    }
+
+    #[test]
     fn what_is_not_available_any_more_is_not_repeated() {
         let rng = RunSeed(0).stream(Stream::Exploration, 0);
-        let mut exploration = Exploration::new(1.0, 1.0, 1, rng);
+        let mut exploration = Exploration::new(Choice::EpsilonGreedy(1.0), 1.0, 1, rng);
         assert_eq!(exploration.explore(0, &[0, 1, 0]), Some(1));
         assert_eq!(exploration.explore(0, &[1, 0, 0]), Some(0));
     }

@@ -15,7 +15,7 @@ pub mod wire;
 
 pub use dims::{Dims, DimsError};
 pub use episode::{End, Episode, EpisodeBuilder};
-pub use exploration::Exploration;
+pub use exploration::{Choice, Exploration};
 pub use observation::Observation;
 pub use policy::{Policy, Turn};
 pub use streams::{Rng, RunSeed, Stream};

@@ -22,7 +22,7 @@ use rit_env::{
     particle::Script,
     rollout::{Job, Rollout},
 };
-use rit_episode::{Episode, RunSeed, Stream};
+use rit_episode::{Choice, Episode, RunSeed, Stream};
 use rustix::time::{ClockId, clock_gettime};
 use serde_json::{Map, Value};
 use std::{process::ExitCode, sync::Arc, time::Duration};
@@ -132,7 +132,8 @@ fn seconds(clock: ClockId) -> f64 {
 /// Episodes of random actions of these tasks.
 fn random_episodes(config: &Config, tasks: &[Task], count: u64) -> Vec<Episode> {
     let mut rollout = Rollout::new(tasks.to_vec(), config.environment_options(), RunSeed(1), true);
-    let jobs: Vec<Job> =
-        (0..count).map(|number| Job { number, weights_version: 0, epsilon: 1.0, task: None }).collect();
+    let jobs: Vec<Job> = (0..count)
+        .map(|number| Job { number, weights_version: 0, choice: Choice::EpsilonGreedy(1.0), task: None })
+        .collect();
     jobs.chunks(64).flat_map(|jobs| rollout.roll(&mut Script::Random, jobs)).collect()
 }

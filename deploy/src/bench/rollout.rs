@@ -44,10 +44,11 @@ pub(super) fn measure(
     let mut rollout =
         Rollout::new(tasks, config.environment_options(), config.seed, config.algorithm.random_permutation);
     let side_by_side = side_by_side(config);
+    let choice = model.method().exploring(0.05);
     let mut number = 0;
     let mut roll = |acting: &mut Acting| -> u64 {
         let jobs: Vec<Job> = (number..number + side_by_side)
-            .map(|number| Job { number, weights_version: 0, epsilon: 0.05, task: None })
+            .map(|number| Job { number, weights_version: 0, choice, task: None })
             .collect();
         number += side_by_side;
         rollout.roll(acting, &jobs).iter().map(|episode| episode.steps() as u64).sum()

@@ -10,18 +10,18 @@ struct Run {
     _folder: tempfile::TempDir,
     run_dir: RunDir,
     learner: Box<dyn Learner>,
-    algorithm: Algorithm,
+    config: Config,
 }
 
 fn run() -> Run {
-    let config = rit_config::resolve("environment.task_set = \"matrix-game\"", "test", &[]).unwrap();
+    let mut config = rit_config::resolve("environment.task_set = \"matrix-game\"", "test", &[]).unwrap();
     let folder = tempfile::tempdir().unwrap();
     let run_dir = RunDir::create(&folder.path().join("run"), &config).unwrap();
-    let algorithm = Algorithm { buffer_size: 0, ..config.algorithm.clone() };
+    config.algorithm.buffer_size = 0;
     let model = Arc::new(Model::new(config.model()).unwrap());
     let params = model.initial(&mut RunSeed(1).stream(Stream::Weights, 0));
     let learner = rit_algo::learner(model, config.update(), params).unwrap();
-    Run { _folder: folder, run_dir, learner, algorithm }
+    Run { _folder: folder, run_dir, learner, config }
 }
 
 impl Run {
@@ -75,7 +75,7 @@ impl Run {
         let layout = PayloadLayout::new(dims);
         let tasks = vec![TaskSize { n_agents: 2, n_entities: 2 }; 2];
         let expected = Expected { run_id: self.run_dir.run_id(), layout, tasks };
-        load_newest(&self.run_dir, &*self.learner, &expected, &self.algorithm)
+        load_newest(&self.run_dir, &*self.learner, &expected, &self.config)
     }
 }
 
@@ -89,7 +89,7 @@ fn a_state_comes_back_whole_and_latest_is_the_newest() {
     assert_eq!(loaded.state, run.state(100));
     assert!(loaded.damaged.is_empty());
     let latest = run.run_dir.checkpoints().join(LATEST);
-    assert_eq!(load(&latest, &*run.learner, 2, &run.algorithm).unwrap(), run.state(100));
+    assert_eq!(load(&latest, &*run.learner, 2, &run.config.algorithm).unwrap(), run.state(100));
     run.save(100);
     assert_eq!(run.load().unwrap().unwrap().state, run.state(100), "once more by request");
 }

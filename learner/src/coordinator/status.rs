@@ -41,7 +41,7 @@ impl Coordinator {
             ledger: Some(self.ledger_status()),
             replay_episodes: *replay_episodes as u64,
             pid: std::process::id(),
-            replay_episodes_max: self.config.algorithm.buffer_size as u64,
+            replay_episodes_max: self.config.replay_episodes() as u64,
             q_total_mean: of("q_total_mean"),
             target_mean: of("target_mean"),
             rates: Some(self.rates.rates()),

@@ -7,7 +7,7 @@ use rit_algo::{
     flat::Slots,
     on_policy::{ActorCritic, Losses, Ppo, PpoConfig, Said, Targets},
 };
-use rit_episode::{Episode, Exploration, Observation, Policy, RunSeed, Stream, Turn};
+use rit_episode::{Choice, Episode, Exploration, Observation, Policy, RunSeed, Stream, Turn};
 use rit_nn::{Optimizer, categorical, optimizer};
 use serde::Deserialize;
 use std::{collections::HashMap, fs, path::Path, sync::Arc};
@@ -344,7 +344,8 @@ fn act(policy: &mut dyn Policy, episode: &Episode, n_actions: usize) -> Vec<u8> 
             let available = &episode.available[(time * n + agent) * n_actions..][..n_actions];
             observation.available_mut(agent).copy_from_slice(available);
         }
-        let mut exploration = Exploration::new(0.0, 0.0, n, RunSeed(0).stream(Stream::Exploration, 0));
+        let mut exploration =
+            Exploration::new(Choice::Greedy, 0.0, n, RunSeed(0).stream(Stream::Exploration, 0));
         policy.act(&mut [Turn {
             slot: 0,
             observation: &observation,

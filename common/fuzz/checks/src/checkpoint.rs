@@ -123,8 +123,7 @@ impl Run {
     #[allow(clippy::panic, reason = "that is how a fuzzer learns of it")]
     fn load(&self) -> bool {
         let Ok(learner) = learner(&self.model, &self.config) else { panic!("no threads") };
-        let loaded =
-            checkpoint::load_newest(&self.run_dir, &*learner, &self.expected, &self.config.algorithm);
+        let loaded = checkpoint::load_newest(&self.run_dir, &*learner, &self.expected, &self.config);
         let Ok(loaded) = loaded else { return false };
         let (to_write, _) = mpsc::channel();
         let run_dir = self.run_dir.clone();

@@ -7,7 +7,7 @@ use rit_env::{
     rollout::{Job, Rollout},
 };
 use rit_episode::{
-    Dims, Episode, RunSeed,
+    Choice, Dims, Episode, RunSeed,
     wire::{self, Expected, Frame, Header, PayloadLayout, RunId, TaskSize},
 };
 
@@ -87,8 +87,9 @@ pub fn seeds() -> Vec<(String, Vec<u8>)> {
 pub(crate) fn matrix_episodes(count: u64) -> Vec<Episode> {
     let tasks = TaskSet::MatrixGame.tasks(Split::Training);
     let mut rollout = Rollout::new(tasks, EnvironmentOptions::default(), RunSeed(3), true);
-    let jobs: Vec<Job> =
-        (0..count).map(|number| Job { number, weights_version: 0, epsilon: 1.0, task: None }).collect();
+    let jobs: Vec<Job> = (0..count)
+        .map(|number| Job { number, weights_version: 0, choice: Choice::EpsilonGreedy(1.0), task: None })
+        .collect();
     rollout.roll(&mut Script::Random, &jobs)
 }
 

@@ -4,7 +4,7 @@ use crate::{
     rollout::{Job, Rollout},
 };
 use rand::RngExt as _;
-use rit_episode::{Exploration, RunSeed, Stream};
+use rit_episode::{Choice, Exploration, RunSeed, Stream};
 
 /// Mean total reward of a script over testing tasks, mixed evenly, and its standard error.
 fn mean_reward(set: TaskSet, mut script: Script, episodes: usize) -> (f64, f64) {
@@ -12,7 +12,7 @@ fn mean_reward(set: TaskSet, mut script: Script, episodes: usize) -> (f64, f64) 
     let job = |number: usize| Job {
         number: number as u64,
         weights_version: 0,
-        epsilon: 0.0,
+        choice: Choice::Greedy,
         task: Some(number % tasks.len()),
     };
     let jobs: Vec<Job> = (0..episodes).map(job).collect();
@@ -72,7 +72,7 @@ fn act(mut script: Script, observation: &Observation) -> Vec<Action> {
         observation,
         previous_reward: 0.0,
         exploration: &mut Exploration::new(
-            0.0,
+            Choice::Greedy,
             0.0,
             observation.n_agents(),
             RunSeed(0).stream(Stream::Exploration, 0),
