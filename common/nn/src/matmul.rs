@@ -3,7 +3,7 @@
 //!
 //! A product's row depends on that row's input alone, not on how many rows are multiplied beside it: the
 //! same state must get the same utilities whichever other environments an actor steps at the same time. faer
-//! gives this for two rows and more; see [`x_wt`] for one row, and the test below.
+//! gives this from [`least_rows`] rows on; fewer get rows of zeros beside them.
 
 use crate::{View, ViewMut};
 use faer::{Par, linalg::matmul::matmul, mat};
@@ -43,8 +43,9 @@ fn count(m: usize, k: usize, n: usize) {
 /// `y = x wᵀ`, or `y += x wᵀ`: a layer's forward. `x` (rows, in), `w` (out, in), `y` (rows, out).
 pub fn x_wt(x: View<'_>, w: View<'_>, y: ViewMut<'_>, accum: Accum) {
     debug_assert_eq!((x.cols, x.rows, y.cols), (w.cols, y.rows, w.rows));
-    if x.rows == 1 {
-        return single_row(x, y, accum, |x, y| x_wt(x, w, y, accum));
+    let rows = least_rows(x.cols, w.rows);
+    if (1..rows).contains(&x.rows) {
+        return few_rows(x, y, accum, rows, |x, y| x_wt(x, w, y, accum));
     }
     count(x.rows, x.cols, w.rows);
     matmul(write(y), accum.into(), read(x), read(w).transpose(), 1.0_f32, Par::Seq);
@@ -53,8 +54,9 @@ pub fn x_wt(x: View<'_>, w: View<'_>, y: ViewMut<'_>, accum: Accum) {
 /// `y = x w`, or `y += x w`: the forward of a layer whose weight stands the other way, `w` (in, out). `x` (rows, in),
 /// `y` (rows, out).
 pub fn x_w(x: View<'_>, w: View<'_>, y: ViewMut<'_>, accum: Accum) {
-    if x.rows == 1 {
-        return single_row(x, y, accum, |x, y| x_w(x, w, y, accum));
+    let rows = least_rows(x.cols, w.cols);
+    if (1..rows).contains(&x.rows) {
+        return few_rows(x, y, accum, rows, |x, y| x_w(x, w, y, accum));
     }
     dy_w(x, w, y, accum);
 }
@@ -74,18 +76,34 @@ pub fn dyt_x(dy: View<'_>, x: View<'_>, dw: ViewMut<'_>, accum: Accum) {
     matmul(write(dw), accum.into(), read(dy).transpose(), read(x), 1.0_f32, Par::Seq);
 }
 
-/// One row goes through faer's matrix–vector path, which sums in another order. A second row of zeros keeps
-/// it on the path that all other row counts take.
-fn single_row(x: View<'_>, mut y: ViewMut<'_>, accum: Accum, product: impl FnOnce(View<'_>, ViewMut<'_>)) {
-    let mut two = vec![0.0; 2 * x.cols];
-    two[..x.cols].copy_from_slice(x.row(0));
-    let mut out = vec![0.0; 2 * y.cols];
-    if accum == Accum::Add {
-        out[..y.cols].copy_from_slice(y.row(0));
+/// The fewest rows whose product is summed as that of many rows is. One row goes through faer's matrix–vector path,
+/// and products of no more than 4096 multiplications through one that sums inputs beyond 64 apart.
+fn least_rows(inputs: usize, outputs: usize) -> usize {
+    const SMALL: usize = 4096;
+    const CHUNK: usize = 64;
+    if inputs > CHUNK { (SMALL / (inputs * outputs.max(1)) + 1).max(2) } else { 2 }
+}
+
+/// A product with as many rows of zeros behind those of `x` as make `rows`.
+fn few_rows(
+    x: View<'_>,
+    mut y: ViewMut<'_>,
+    accum: Accum,
+    rows: usize,
+    product: impl FnOnce(View<'_>, ViewMut<'_>),
+) {
+    let (mut padded, mut out) = (vec![0.0; rows * x.cols], vec![0.0; rows * y.cols]);
+    for row in 0..x.rows {
+        padded[row * x.cols..][..x.cols].copy_from_slice(x.row(row));
+        if accum == Accum::Add {
+            out[row * y.cols..][..y.cols].copy_from_slice(y.row(row));
+        }
     }
-    product(View::dense(&two, x.cols), ViewMut::dense(&mut out, y.cols));
-    let cols = y.cols;
-    y.row(0).copy_from_slice(&out[..cols]);
+    product(View::dense(&padded, x.cols), ViewMut::dense(&mut out, y.cols));
+    for row in 0..x.rows {
+        let of_row = row * y.cols..(row + 1) * y.cols;
+        y.row(row).copy_from_slice(&out[of_row]);
+    }
 }
 
 fn read(view: View<'_>) -> mat::MatRef<'_, f32> {
@@ -175,6 +193,14 @@ mod tests {
             (64, 20),
             (9, 8),
             (192, 192),
+            (144, 64),
+            // Few outputs of many inputs: small products.
+            (77, 8),
+            (128, 5),
+            (200, 2),
+            (300, 1),
+            (65, 31),
+            (65, 32),
         ] {
             // By themselves, and as columns of wider matrices, both of them.
             for (accum, margin) in
