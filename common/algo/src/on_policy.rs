@@ -4,13 +4,16 @@
 //! targets and the value normaliser follow ([`targets`]). Then come `epochs` × `minibatches` optimiser steps
 //! on the clipped losses ([`loss`]). Between batches nothing is kept but weights, moments and the normaliser.
 
+mod learner;
 mod loss;
 mod targets;
 
+pub use learner::PpoLearner;
+pub(crate) use learner::measures;
 pub use loss::Sums;
 pub use targets::{Said, Targets};
 
-use crate::{Rows, TerminalStates, decoder::best, estimators::value_norm::ValueNorm};
+use crate::{Rows, TerminalStates, decoder::best, estimators::value_norm::ValueNorm, learner::Measure};
 use loss::Counts;
 use rand::{Rng, seq::SliceRandom as _};
 use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder, prelude::*};
@@ -39,6 +42,9 @@ pub trait ActorCritic: Send + Sync {
 
     /// What a value belongs to.
     fn value_rows(&self) -> ValueRows;
+
+    /// What an update reports: the measures of all such methods, then the norms of the gradients that are clipped apart.
+    fn measures(&self) -> &'static [Measure];
 
     /// Makes what [`ActorCritic::forward`] reads from `inputs.rows`.
     fn fill(&self, inputs: &mut Inputs);

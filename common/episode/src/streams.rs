@@ -33,6 +33,8 @@ pub enum Stream {
     RoleNoise = 9,
     /// The same of the target network.
     TargetRoleNoise = 10,
+    /// The order in which an epoch's minibatches take a batch's episodes; indexed by update · epochs + epoch.
+    Minibatches = 11,
 }
 
 /// The seed of a run, or of one evaluation.

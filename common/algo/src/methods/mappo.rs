@@ -7,13 +7,20 @@ pub use acting::MappoActing;
 use crate::{
     Rows,
     flat::Slots,
-    on_policy::{ActorCritic, Inputs, Outputs, ValueRows},
+    learner::Measure,
+    on_policy::{self, ActorCritic, Inputs, Outputs, ValueRows},
 };
 use rit_nn::{
     Gru, LayerNorm, Layout, LayoutBuilder, Linear, View,
     tape::{Tape, Var},
 };
 use std::{f32::consts::SQRT_2, ops::Range};
+
+/// What an update reports.
+const MEASURES: [Measure; 10] = on_policy::measures([
+    Measure { name: "actor_grad_norm", help: "Norm of the actor's gradient before clipping" },
+    Measure { name: "critic_grad_norm", help: "Norm of the critic's gradient before clipping" },
+]);
 
 /// Sizes of the networks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -74,6 +81,10 @@ impl ActorCritic for Mappo {
 
     fn value_rows(&self) -> ValueRows {
         ValueRows::States
+    }
+
+    fn measures(&self) -> &'static [Measure] {
+        const { &MEASURES }
     }
 
     fn fill(&self, inputs: &mut Inputs) {

@@ -7,7 +7,8 @@ pub use acting::MatActing;
 
 use crate::{
     flat::Slots,
-    on_policy::{ActorCritic, Inputs, Outputs, ValueRows},
+    learner::Measure,
+    on_policy::{self, ActorCritic, Inputs, Outputs, ValueRows},
 };
 use rit_nn::{
     Attention, LayerNorm, Layout, LayoutBuilder, Linear, View,
@@ -15,6 +16,10 @@ use rit_nn::{
     tape::{Tape, Var},
 };
 use std::{f32::consts::SQRT_2, ops::Range};
+
+/// What an update reports.
+const MEASURES: [Measure; 9] =
+    on_policy::measures([Measure { name: "grad_norm", help: "Gradient norm before clipping" }]);
 
 /// Sizes of the networks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -136,6 +141,10 @@ impl ActorCritic for Mat {
 
     fn value_rows(&self) -> ValueRows {
         ValueRows::Agents
+    }
+
+    fn measures(&self) -> &'static [Measure] {
+        const { &MEASURES }
     }
 
     fn fill(&self, inputs: &mut Inputs) {
