@@ -4,7 +4,8 @@
 mod common;
 
 use common::{
-    RunFolder, Train, actor_pid, json_lines, kill, learner_pid, pids, rit, shared_memory_of, wait_until_gone,
+    RunFolder, Train, actor_pid, json_lines, kill, learner_pid, output, pids, rit, shared_memory_of,
+    wait_until_gone,
 };
 use rustix::process::Signal;
 use serde_json::Value;
@@ -184,14 +185,21 @@ fn a_damaged_checkpoint_is_reported_and_the_one_before_is_used() {
     folder.train(&[RUN, &["--steps", "300"]].concat());
     let newest = fs::canonicalize(folder.run_dir().join("checkpoints/latest")).unwrap();
     fs::write(newest.join("state.safetensors"), "damaged").unwrap();
-    let summary = Train::resume(&folder, &["--steps", "800"]).finish();
+    let run_dir = folder.run_dir();
+    let resumed = output(&["train", "--resume", run_dir.to_str().unwrap(), "--steps", "800"]);
+    let stderr = String::from_utf8_lossy(&resumed.stderr);
+    assert!(resumed.status.success(), "{stderr}");
+    let said = "warning: a checkpoint is damaged, the one at 240 steps is used: ";
+    assert!(stderr.contains(said) && stderr.contains("state.safetensors was altered"), "{stderr}");
+    let summary = serde_json::from_slice(&fs::read(run_dir.join("summary.json")).unwrap()).unwrap();
     nothing_was_lost(&folder, &summary);
-    let log = fs::read_to_string(folder.run_dir().join("logs/learner.log")).unwrap();
-    assert!(log.contains("a checkpoint is damaged; the one before is used"), "{log}");
 
     // All of them damaged: never a silent fresh start.
     for entry in fs::read_dir(folder.run_dir().join("checkpoints")).unwrap() {
-        fs::write(entry.unwrap().path().join("SHA256SUMS"), "").unwrap();
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            fs::write(path.join("SHA256SUMS"), "").unwrap();
+        }
     }
     let refused = Train::resume(&folder, &["--steps", "900"]).wait();
     assert_eq!(refused.status.code(), Some(2));
@@ -232,6 +240,51 @@ fn what_would_change_the_result_cannot_change() {
     assert_eq!(refused.status.code(), Some(2));
     let stderr = String::from_utf8_lossy(&refused.stderr);
     assert!(stderr.contains("algorithm.gamma cannot change in a run that has begun"), "{stderr}");
+}
+
+/// What was done to a run directory after it was trained in, and what is said of it; nothing is trained anew.
+#[test]
+fn what_does_not_belong_together_is_refused() {
+    let (folder, other) = (RunFolder::new(), RunFolder::new());
+    folder.train(&[RUN, &["--steps", "300"]].concat());
+    other.train(&[RUN, &["--steps", "400"]].concat());
+    let run_dir = folder.run_dir();
+    let (config, checkpoints) = (run_dir.join("config.toml"), run_dir.join("checkpoints"));
+    let metrics = fs::read(run_dir.join("metrics.jsonl")).unwrap();
+    let refused = |arguments: &[&str], message: &[&str]| {
+        common::refused(&[&["train", "--resume", run_dir.to_str().unwrap()], arguments].concat(), message);
+        assert_eq!(fs::read(run_dir.join("metrics.jsonl")).unwrap(), metrics, "nothing was written");
+    };
+    refused(&["--steps", "200"], &["training.t_max = 200, and 300 steps are done already", "--steps"]);
+
+    let good = fs::read_to_string(&config).unwrap();
+    for (from, to, key) in
+        [("seed = 3", "seed = 4", "seed"), ("gamma = 0.99", "gamma = 0.5", "algorithm.gamma")]
+    {
+        assert!(good.contains(from), "{good}");
+        fs::write(&config, good.replace(from, to)).unwrap();
+        refused(&[], &[&format!("it was trained with {key} = "), "set it back"]);
+    }
+    fs::write(&config, good).unwrap();
+
+    let theirs = fs::canonicalize(other.run_dir().join("checkpoints/latest")).unwrap();
+    let foreign = checkpoints.join(theirs.file_name().unwrap());
+    fs::rename(theirs, &foreign).unwrap();
+    refused(&[], &["step-000000000400: it is of another run", "move it away"]);
+    fs::remove_dir_all(foreign).unwrap();
+
+    for entry in fs::read_dir(&checkpoints).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() && !path.is_symlink() {
+            fs::remove_dir_all(path).unwrap();
+        }
+    }
+    refused(
+        &[],
+        &["holds no checkpoint, and this run has written some", "step-000000000300", "put them back"],
+    );
+    fs::remove_file(checkpoints.join("latest")).unwrap();
+    refused(&[], &["holds no checkpoint, and this run has written some"]);
 }
 
 /// `deploy/rit-run.sh`, which service managers call again and again.

@@ -11,23 +11,30 @@
 //!
 //! Replay lies beside them in `replay/`, written as it grows (see [`crate::replay_log`]). Random streams need no
 //! place: they follow from the seed and the progress. A folder is written beside its place, made durable and
-//! then renamed there, so it is whole or not there. `checkpoints/latest` is a link to the newest.
+//! then renamed there, so it is whole or not there, and no folder is ever replaced. `checkpoints/latest` is a link to
+//! the newest; `checkpoints.json`, beside the folder of them all, says that there are some.
 
+mod folders;
 mod manifest;
+mod newest;
+mod origin;
+mod written;
 
 pub use manifest::{Manifest, Progress, SnapshotMark};
+pub use newest::{Loaded, load_newest};
+pub use origin::{FORMAT_VERSION, Origin, OtherOrigin};
 
 use crate::{
-    replay_log::{self, ReplayLogError, remedy},
+    replay_log::{ReplayLogError, remedy},
     weights::Snapshot,
     weights_file::{self, WeightsFileError},
 };
+use folders::PARTIAL;
 use rit_algo::{
     Learner, Model,
     learner::{NamedState, Numbers},
 };
-use rit_config::{Algorithm, Config, RunDir};
-use rit_episode::{Episode, wire::Expected};
+use rit_config::{Algorithm, RunDir};
 use safetensors::{Dtype, SafeTensorError, SafeTensors, tensor::TensorView};
 use sha2::{Digest as _, Sha256};
 use std::{
@@ -44,8 +51,8 @@ const MANIFEST: &str = "checkpoint.json";
 const SUMS: &str = "SHA256SUMS";
 /// The link to the newest checkpoint.
 pub const LATEST: &str = "latest";
-/// What a folder is called while it is written.
-const PARTIAL: &str = "partial";
+/// No file of a checkpoint is longer: whatever lies in its place is not read to its end.
+const FILE_BYTES_MAX: u64 = 1 << 36;
 
 /// All that training needs to go on, but for replay.
 #[derive(Clone, Debug, PartialEq)]
@@ -99,6 +106,22 @@ pub enum CheckpointError {
         /// What does not fit.
         what: String,
     },
+    /// Another run's, or one that was trained otherwise.
+    #[error("{folder}: {what}")]
+    Other {
+        /// The checkpoint.
+        folder: PathBuf,
+        /// What differs.
+        what: OtherOrigin,
+    },
+    /// A renamed one.
+    #[error("{folder} holds the checkpoint at {env_steps} steps and is called otherwise; it is left out")]
+    Misnamed {
+        /// The checkpoint.
+        folder: PathBuf,
+        /// What its manifest says.
+        env_steps: u64,
+    },
     /// Checkpoints there are, and none can be used.
     #[error("no checkpoint in {folder} can be used; the newest: {newest}")]
     NoneUsable {
@@ -107,6 +130,30 @@ pub enum CheckpointError {
         /// What is wrong with the newest.
         newest: Box<CheckpointError>,
     },
+    /// Checkpoints there were.
+    #[error(
+        "{folder} holds no checkpoint, and this run has written some (the newest: {newest}); put them back, or begin a \
+         new run in another directory"
+    )]
+    Gone {
+        /// The folder of all checkpoints.
+        folder: PathBuf,
+        /// The newest one's folder.
+        newest: String,
+    },
+    /// Fewer steps are wanted than there are.
+    #[error(
+        "training.t_max = {t_max}, and {env_steps} steps are done already; set it higher (--steps), or leave it as it was"
+    )]
+    StepsDone {
+        /// The steps wanted.
+        t_max: u64,
+        /// The steps done.
+        env_steps: u64,
+    },
+    /// The configuration cannot be written down.
+    #[error(transparent)]
+    Config(#[from] rit_config::ConfigError),
 }
 
 /// Writes a checkpoint, points `latest` to it and removes all but the newest `keep`. Returns its folder, relative
@@ -121,11 +168,10 @@ pub fn save(
     keep: usize,
 ) -> Result<PathBuf, CheckpointError> {
     let all = run_dir.checkpoints();
-    let name = format!("step-{:012}", state.manifest.progress.env_steps);
+    fs::create_dir_all(&all).map_err(io(&all))?;
+    folders::remove_partial(&all)?;
+    let name = folders::free_name(&all, state.manifest.progress.env_steps)?;
     let (folder, partial) = (all.join(&name), all.join(format!("{name}.{PARTIAL}")));
-    if partial.exists() {
-        fs::remove_dir_all(&partial).map_err(io(&partial))?;
-    }
     fs::create_dir(&partial).map_err(io(&partial))?;
     let written = write_folder(&partial, model, state);
     if written.is_err() {
@@ -133,23 +179,15 @@ pub fn save(
         let _ = fs::remove_dir_all(&partial);
     }
     written?;
-    if folder.exists() {
-        // The same step once more, by request or after a damaged one.
-        let old = folder.with_extension(PARTIAL);
-        fs::rename(&partial, folder.with_extension("new")).map_err(io(&partial))?;
-        fs::rename(&folder, &old).map_err(io(&folder))?;
-        fs::rename(folder.with_extension("new"), &folder).map_err(io(&folder))?;
-        fs::remove_dir_all(&old).map_err(io(&old))?;
-    } else {
-        fs::rename(&partial, &folder).map_err(io(&folder))?;
-    }
+    fs::rename(&partial, &folder).map_err(io(&folder))?;
     // A link cannot be replaced in place; a new one can be renamed over it.
     let (link, new_link) = (all.join(LATEST), all.join(format!("{LATEST}.{PARTIAL}")));
     let _ = fs::remove_file(&new_link);
     symlink(&name, &new_link).and_then(|()| fs::rename(&new_link, &link)).map_err(io(&link))?;
     sync(&all)?;
-    for old in folders(&all)?.into_iter().rev().skip(keep.max(1)) {
-        fs::remove_dir_all(&old).map_err(io(&old))?;
+    written::remember(run_dir, &state.manifest.origin, &name)?;
+    if let Some(folder) = folders::named(&all, &name) {
+        folders::forget_old(&all, &folder, keep)?;
     }
     Ok(Path::new("checkpoints").join(name))
 }
@@ -183,6 +221,14 @@ fn write(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
     written.map_err(io(path))
 }
 
+/// Writes a small file anew: it is the old one or the new one at every moment.
+fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
+    let partial = path.with_extension(PARTIAL);
+    write(&partial, bytes)?;
+    fs::rename(&partial, path).map_err(io(path))?;
+    path.parent().map_or(Ok(()), sync)
+}
+
 fn sync(folder: &Path) -> Result<(), CheckpointError> {
     File::open(folder).and_then(|folder| folder.sync_all()).map_err(io(folder))
 }
@@ -192,57 +238,27 @@ fn io(path: &Path) -> impl FnOnce(io::Error) -> CheckpointError {
     move |error| CheckpointError::Io { path, error }
 }
 
-/// A checkpoint that training goes on from.
-#[derive(Debug)]
-pub struct Loaded {
-    /// Its folder.
-    pub folder: PathBuf,
-    /// All but replay.
-    pub state: TrainingState,
-    /// Replay, oldest first.
-    pub replay: Vec<Episode>,
-    /// What was wrong with newer ones.
-    pub damaged: Vec<CheckpointError>,
-}
-
-impl Loaded {
-    /// What somebody should know of: newer checkpoints that could not be used.
-    pub fn warnings(&self) -> Vec<String> {
-        let env_steps = self.state.manifest.progress.env_steps;
-        let words = |error| format!("a checkpoint is damaged, the one at {env_steps} steps is used: {error}");
-        self.damaged.iter().map(words).collect()
+/// A file of a checkpoint, if it is the one in the list of sums.
+fn read_checked(folder: &Path, name: &str) -> Result<Vec<u8>, CheckpointError> {
+    let read = |name: &str| {
+        let path = folder.join(name);
+        rit_config::read_regular(&path, FILE_BYTES_MAX).map_err(io(&path))
+    };
+    let (sums, bytes) = (read(SUMS)?, read(name)?);
+    let line = format!("{}  {name}", sha256(&bytes));
+    if String::from_utf8_lossy(&sums).lines().any(|known| known == line) {
+        Ok(bytes)
+    } else {
+        Err(CheckpointError::Altered { path: folder.join(name) })
     }
 }
 
-/// The newest checkpoint that is whole and of a run that this learner can go on from, with replay's last episodes;
-/// `None` where none was ever written.
-///
-/// # Errors
-/// When there are checkpoints and none can be used.
-pub fn load_newest(
-    run_dir: &RunDir,
-    learner: &dyn Learner,
-    expected: &Expected,
-    config: &Config,
-) -> Result<Option<Loaded>, CheckpointError> {
-    let all = run_dir.checkpoints();
-    let mut damaged = Vec::new();
-    for folder in folders(&all)?.into_iter().rev() {
-        let loaded = load(&folder, learner, expected.tasks.len(), &config.algorithm).and_then(|state| {
-            let end = state.manifest.progress.episodes;
-            let numbers = end.saturating_sub(config.replay_episodes() as u64)..end;
-            let replay = replay_log::read(&run_dir.replay(), expected, numbers)?;
-            Ok((state, replay))
-        });
-        match loaded {
-            Ok((state, replay)) => return Ok(Some(Loaded { folder, state, replay, damaged })),
-            Err(error) => damaged.push(error),
-        }
-    }
-    if damaged.is_empty() {
-        return Ok(None);
-    }
-    Err(CheckpointError::NoneUsable { folder: all, newest: Box::new(damaged.swap_remove(0)) })
+/// What a checkpoint says of itself.
+fn load_manifest(folder: &Path) -> Result<Manifest, CheckpointError> {
+    serde_json::from_slice(&read_checked(folder, MANIFEST)?).map_err(|error| CheckpointError::Inconsistent {
+        path: folder.join(MANIFEST),
+        what: error.to_string(),
+    })
 }
 
 /// Reads one checkpoint's folder.
@@ -252,25 +268,16 @@ fn load(
     tasks: usize,
     algorithm: &Algorithm,
 ) -> Result<TrainingState, CheckpointError> {
-    let read = |name: &str| fs::read(folder.join(name)).map_err(io(&folder.join(name)));
-    let sums = String::from_utf8_lossy(&read(SUMS)?).into_owned();
-    let checked = |name: &str| {
-        let bytes = read(name)?;
-        let line = format!("{}  {name}", sha256(&bytes));
-        if sums.lines().any(|known| known == line) {
-            Ok(bytes)
-        } else {
-            Err(CheckpointError::Altered { path: folder.join(name) })
-        }
-    };
     let inconsistent =
         |name: &str, what: String| CheckpointError::Inconsistent { path: folder.join(name), what };
-    let manifest: Manifest = serde_json::from_slice(&checked(MANIFEST)?)
-        .map_err(|error| inconsistent(MANIFEST, error.to_string()))?;
+    let manifest = load_manifest(folder)?;
     manifest.check(tasks, algorithm).map_err(|what| inconsistent(MANIFEST, what))?;
-    checked(WEIGHTS)?;
+    read_checked(folder, WEIGHTS)?;
     let params = weights_file::load(&folder.join(WEIGHTS), learner.model().layout())?;
-    let bytes = checked(STATE)?;
+    if weights_file::digest(&params) != manifest.weights_digest {
+        return Err(inconsistent(WEIGHTS, format!("its weights are not those that {MANIFEST} names")));
+    }
+    let bytes = read_checked(folder, STATE)?;
     let format = |error| CheckpointError::Format { path: folder.join(STATE), error };
     let tensors = SafeTensors::deserialize(&bytes).map_err(format)?;
     let tensor = |name: &str, kind: Dtype, len: usize| {
@@ -335,32 +342,14 @@ fn encode_state(state: &TrainingState) -> Result<Vec<u8>, SafeTensorError> {
     safetensors::serialize(views.collect::<Result<Vec<_>, _>>()?, None)
 }
 
-/// The checkpoints' folders, oldest first.
-fn folders(all: &Path) -> Result<Vec<PathBuf>, CheckpointError> {
-    let mut folders = Vec::new();
-    for entry in fs::read_dir(all).map_err(io(all))? {
-        let name = entry.map_err(io(all))?.file_name();
-        let steps = name.to_str().and_then(|name| name.strip_prefix("step-"));
-        if steps.is_some_and(|steps| steps.bytes().all(|byte| byte.is_ascii_digit())) {
-            folders.push(all.join(name));
-        }
-    }
-    folders.sort();
-    Ok(folders)
-}
-
 /// Episode numbers that the oldest checkpoint kept needs of replay: all from here on.
 ///
 /// # Errors
 /// When the folder cannot be read.
 pub fn replay_needed_from(run_dir: &RunDir, replay_episodes: usize) -> Result<u64, CheckpointError> {
-    let oldest = folders(&run_dir.checkpoints())?.into_iter().next();
-    let episodes = oldest.and_then(|folder| {
-        let manifest: Manifest = serde_json::from_slice(&fs::read(folder.join(MANIFEST)).ok()?).ok()?;
-        Some(manifest.progress.episodes)
-    });
-    // One that cannot be read keeps everything: another may yet be needed.
-    Ok(episodes.map_or(0, |episodes| episodes.saturating_sub(replay_episodes as u64)))
+    let kept = folders::list_named_right(&run_dir.checkpoints())?;
+    let oldest = kept.first().map_or(0, |(_, manifest)| manifest.progress.episodes);
+    Ok(oldest.saturating_sub(replay_episodes as u64))
 }
 
 fn sha256(bytes: &[u8]) -> String {

@@ -264,9 +264,8 @@ fn load(
     config: &Config,
 ) -> Result<Option<Loaded>, LearnerError> {
     let loaded = checkpoint::load_newest(run_dir, learner, expected, config)?;
-    if let Some(loaded) = &loaded {
-        loaded.warnings().iter().for_each(|warning| tracing::warn!("{warning}"));
-        let Loaded { folder, state, .. } = loaded;
+    if let Some(Loaded { folder, state, warnings, .. }) = &loaded {
+        warnings.iter().for_each(|warning| tracing::warn!("{warning}"));
         let (folder, env_steps) = (folder.display(), state.manifest.progress.env_steps);
         tracing::info!(%folder, env_steps, "going on from a checkpoint");
     }

@@ -2,7 +2,7 @@
 //! weights; nothing it does depends on time.
 
 use crate::{
-    checkpoint::{Loaded, Manifest, Progress, SnapshotMark, TrainingState},
+    checkpoint::{Loaded, Manifest, Origin, Progress, SnapshotMark, TrainingState},
     evaluation::{Evaluator, TaskResult, by_task, in_words},
     ledger::Terms,
     measured::Measured,
@@ -94,6 +94,9 @@ pub struct Summary {
 /// Why training ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
+    /// The configuration cannot be written down.
+    #[error(transparent)]
+    Config(#[from] rit_config::ConfigError),
     /// The last checkpoint could not be written.
     #[error("the last checkpoint was not written: {0}; `rit train --resume` goes on from the one before")]
     Checkpoint(String),
@@ -144,6 +147,8 @@ pub struct Trainer {
     writer: mpsc::Sender<ToWrite>,
     /// What somebody should know of how the run begins.
     warnings: Vec<String>,
+    /// What checkpoints say of where they come from.
+    origin: Origin,
 }
 
 /// Where a run begins: what the rest of the learner needs to know of it.
@@ -192,7 +197,8 @@ impl Trainer {
             env_steps_before: 0,
             news,
             writer,
-            warnings: loaded.as_ref().map(Loaded::warnings).unwrap_or_default(),
+            warnings: loaded.as_ref().map(|loaded| loaded.warnings.clone()).unwrap_or_default(),
+            origin: Origin::of(&run_dir, &config)?,
             learner,
             run_dir,
             config,
@@ -223,6 +229,7 @@ impl Trainer {
         let TrainingState { params, learner, snapshots, manifest } = loaded.state;
         self.learner.restore(&params, &learner)?;
         self.target_copied_at = manifest.target_copied_at;
+        self.env_steps_before = manifest.env_steps_before;
         self.terms = manifest.terms.into();
         let mut snapshots = snapshots.into_iter();
         if let Some(oldest) = snapshots.next() {
@@ -282,6 +289,7 @@ impl Trainer {
                     let other_result = self.config.algorithm != config.algorithm
                         || self.config.evaluation != config.evaluation;
                     self.config = Config::clone(&config);
+                    self.origin = Origin::of(&self.run_dir, &config)?;
                     if other_result {
                         // What was trained so far is not trained again under other settings.
                         self.checkpoint(None);
@@ -413,7 +421,9 @@ impl Trainer {
             params: self.learner.params().to_vec(),
             learner: self.learner.state().into_iter().map(NamedState::into_owned).collect(),
             manifest: Manifest {
+                origin: self.origin.clone(),
                 progress: self.standing.progress,
+                env_steps_before: self.env_steps_before,
                 target_copied_at: self.target_copied_at,
                 terms: self.terms.iter().copied().collect(),
                 snapshots: kept.iter().map(mark).collect(),

@@ -6,7 +6,7 @@ use rit_env::{EnvironmentOptions, TaskSet};
 use rit_episode::RunSeed;
 use rit_nn::OptimizerKind;
 use serde::{Deserialize, Serialize};
-use std::net::SocketAddr;
+use std::{collections::BTreeMap, net::SocketAddr};
 
 /// Everything a run is made from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -244,6 +244,14 @@ impl From<WebListen> for String {
 }
 
 impl Config {
+    /// The keys that weights follow from, with their values.
+    ///
+    /// # Errors
+    /// When TOML cannot say it.
+    pub fn result_settings(&self) -> Result<BTreeMap<String, String>, ConfigError> {
+        crate::resolve::result_settings(self)
+    }
+
     /// The text that [`resolve`](crate::resolve) makes the same configuration of.
     ///
     /// # Errors

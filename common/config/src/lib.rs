@@ -5,6 +5,7 @@
 //! task set's preset, below the experiment, below the command line. A run directory holds the resolved one.
 
 mod config;
+mod regular_file;
 mod resolve;
 mod run_dir;
 
@@ -12,5 +13,6 @@ pub use config::{
     Actors, Algorithm, Checkpoints, Config, Environment, Evaluation, Learner, MixingKind, Network,
     OptimizerName, Tls, Training, Until, Web, WebListen,
 };
-pub use resolve::{ConfigError, resolve, set, set_live};
+pub use regular_file::{TEXT_BYTES_MAX, read_regular, read_text};
+pub use resolve::{ConfigError, is_live, resolve, set, set_live};
 pub use run_dir::{RunDir, RunDirError};

@@ -201,29 +201,48 @@ pub(crate) fn may_go_on(old: &Config, new: &Config) -> Result<(), ConfigError> {
 
 /// The first key outside these keys and sections that differs.
 fn first_difference(old: &Config, new: &Config, free: &[&str]) -> Result<Option<String>, ConfigError> {
-    let table =
-        |config: &Config| Table::try_from(config).map_err(|error| ConfigError::Value(error.to_string()));
-    let (old, new) = (table(old)?, table(new)?);
-    let keys = |table: &Table| {
-        let mut keys = BTreeMap::new();
-        for (section, value) in table {
-            match value {
-                Value::Table(section_table) => {
-                    keys.extend(
-                        section_table.iter().map(|(key, value)| (format!("{section}.{key}"), value.clone())),
-                    );
-                }
-                value => {
-                    keys.insert(section.clone(), value.clone());
-                }
+    let (old, new) = (flat(old)?, flat(new)?);
+    let mut differing = old.iter().filter(|(key, value)| new.get(*key) != Some(value));
+    Ok(differing.find(|(key, _)| !is_under(key, free)).map(|(key, _)| key.clone()))
+}
+
+/// Whether a key is one of these, or in one of these sections.
+fn is_under(key: &str, keys: &[&str]) -> bool {
+    keys.iter().any(|one| key == *one || key.starts_with(&format!("{one}.")))
+}
+
+/// Every `section.key` with its value.
+fn flat(config: &Config) -> Result<BTreeMap<String, Value>, ConfigError> {
+    let table = Table::try_from(config).map_err(|error| ConfigError::Value(error.to_string()))?;
+    let mut keys = BTreeMap::new();
+    for (section, value) in table {
+        match value {
+            Value::Table(table) => {
+                keys.extend(table.into_iter().map(|(key, value)| (format!("{section}.{key}"), value)));
+            }
+            value => {
+                keys.insert(section, value);
             }
         }
-        keys
+    }
+    Ok(keys)
+}
+
+/// See [`Config::result_settings`].
+pub(crate) fn result_settings(config: &Config) -> Result<BTreeMap<String, String>, ConfigError> {
+    let keys = flat(config)?.into_iter().filter(|(key, _)| !is_under(key, &FREE));
+    let shown = |value: Value| match value {
+        Value::String(text) => text,
+        // 0.99, where an f32 is 0.9900000095367432 on its way through TOML's f64.
+        Value::Float(number) if f64::from(number as f32) == number => (number as f32).to_string(),
+        value => value.to_string(),
     };
-    let (old, new) = (keys(&old), keys(&new));
-    let is_free = |key: &str| free.iter().any(|free| key == *free || key.starts_with(&format!("{free}.")));
-    let mut differing = old.iter().filter(|(key, value)| new.get(*key) != Some(value));
-    Ok(differing.find(|(key, _)| !is_free(key)).map(|(key, _)| key.clone()))
+    Ok(keys.map(|(key, value)| (key, shown(value))).collect())
+}
+
+/// Whether a running learner can change this key.
+pub fn is_live(key: &str) -> bool {
+    is_under(key, &LIVE)
 }
 
 fn parse(text: &str, source_name: &str) -> Result<Table, ConfigError> {
@@ -360,6 +379,37 @@ mod tests {
         assert_eq!(config.seed.0, 9);
         assert_eq!(with(&["training.until=win_rate=1.0"]).unwrap().training.until, Until::WinRate(1.0));
         assert_eq!(with(&["algorithm.gamma=1", "algorithm.gamma=0"]).unwrap().algorithm.gamma, 0.0);
+    }
+
+    #[test]
+    fn what_weights_follow_from_is_told_from_what_they_do_not() {
+        let settings = |text: &str| with(&[text]).unwrap().result_settings().unwrap();
+        let keys = settings("algorithm.gamma=0.99");
+        let value = |key: &str| keys.get(key).map(String::as_str);
+        assert_eq!(
+            (value("algorithm.gamma"), value("environment.task_set")),
+            (Some("0.99"), Some("matrix-game"))
+        );
+        for key in [
+            "seed",
+            "algorithm.policy_lag",
+            "algorithm.epsilon_finish",
+            "network.hidden_dim",
+            "learner.shards",
+        ] {
+            assert!(keys.contains_key(key), "{key}");
+        }
+        for free in [
+            "training.t_max=7",
+            "actors.count=3",
+            "learner.threads=2",
+            "checkpoints.keep=9",
+            "web.listen=off",
+        ] {
+            assert_eq!(settings(free), keys, "{free}");
+        }
+        assert_ne!(settings("algorithm.gamma=0.5"), keys);
+        assert!(is_live("algorithm.epsilon_finish") && !is_live("algorithm.gamma"));
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! `checkpoint.json`, and what it has to say for training to go on from it.
 
+use super::Origin;
 use crate::{
     evaluation::{Exploring, TaskResult},
     ledger::Terms,
@@ -26,9 +27,15 @@ pub struct Progress {
 /// The small part of a checkpoint, as it stands in `checkpoint.json`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
+    /// Whose checkpoint it is.
+    #[serde(default)]
+    pub origin: Origin,
     /// How far training has come. Optimiser steps are updates.
     #[serde(flatten)]
     pub progress: Progress,
+    /// Environment steps before the last batch.
+    #[serde(default)]
+    pub env_steps_before: u64,
     /// Collected episodes when the target network was last copied.
     pub target_copied_at: u64,
     /// What the next batches are rolled with, in order.

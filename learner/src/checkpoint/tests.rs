@@ -1,10 +1,17 @@
 use super::*;
 use crate::{evaluation::Exploring, ledger::Terms, tensorboard::Position};
+use rit_config::Config;
 use rit_episode::{
     RunSeed, Stream,
-    wire::{PayloadLayout, TaskSize},
+    wire::{Expected, PayloadLayout, TaskSize},
 };
-use std::sync::Arc;
+use std::{
+    collections::BTreeSet,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+};
 
 struct Run {
     _folder: tempfile::TempDir,
@@ -15,9 +22,9 @@ struct Run {
 
 fn run() -> Run {
     let mut config = rit_config::resolve("environment.task_set = \"matrix-game\"", "test", &[]).unwrap();
+    config.algorithm.buffer_size = 0;
     let folder = tempfile::tempdir().unwrap();
     let run_dir = RunDir::create(&folder.path().join("run"), &config).unwrap();
-    config.algorithm.buffer_size = 0;
     let model = Arc::new(Model::new(config.model()).unwrap());
     let params = model.initial(&mut RunSeed(1).stream(Stream::Weights, 0));
     let learner = rit_algo::learner(model, config.update(), params).unwrap();
@@ -46,6 +53,8 @@ impl Run {
             learner: learner.collect(),
             snapshots: vec![Snapshot::new(4, 90, &acting), Snapshot::new(5, 100, &acting)],
             manifest: Manifest {
+                origin: Origin::of(&self.run_dir, &self.config).unwrap(),
+                env_steps_before: env_steps - 2,
                 progress: Progress { env_steps, episodes: 10, updates: 5 },
                 target_copied_at: 3,
                 terms: [4, 5].map(|weights_version| Terms { weights_version, epsilon: 0.1 + 0.2 }).to_vec(),
@@ -65,9 +74,22 @@ impl Run {
     }
 
     fn save(&self, env_steps: u64) -> PathBuf {
-        self.run_dir
-            .root()
-            .join(save(&self.run_dir, self.learner.model(), &self.state(env_steps), 3).unwrap())
+        self.save_and_keep(env_steps, 3)
+    }
+
+    fn save_and_keep(&self, env_steps: u64, keep: usize) -> PathBuf {
+        let saved = save(&self.run_dir, self.learner.model(), &self.state(env_steps), keep);
+        self.run_dir.root().join(saved.unwrap())
+    }
+
+    /// The names of what counts as a checkpoint, oldest first.
+    fn names(&self) -> Vec<String> {
+        let folders = folders::list(&self.run_dir.checkpoints()).unwrap();
+        folders.iter().map(|folder| folder.path.file_name().unwrap().to_str().unwrap().to_owned()).collect()
+    }
+
+    fn refusal(&self) -> String {
+        self.load().unwrap_err().to_string()
     }
 
     fn load(&self) -> Result<Option<Loaded>, CheckpointError> {
@@ -87,7 +109,7 @@ fn a_state_comes_back_whole_and_latest_is_the_newest() {
     run.save(100);
     let loaded = run.load().unwrap().unwrap();
     assert_eq!(loaded.state, run.state(100));
-    assert!(loaded.damaged.is_empty());
+    assert!(loaded.warnings.is_empty());
     let latest = run.run_dir.checkpoints().join(LATEST);
     assert_eq!(load(&latest, &*run.learner, 2, &run.config.algorithm).unwrap(), run.state(100));
     run.save(100);
@@ -100,9 +122,7 @@ fn only_the_last_few_are_kept() {
     for env_steps in [10, 20, 30, 40, 50] {
         run.save(env_steps);
     }
-    let kept = folders(&run.run_dir.checkpoints()).unwrap();
-    let names: Vec<_> = kept.iter().map(|path| path.file_name().unwrap().to_str().unwrap()).collect();
-    assert_eq!(names, ["step-000000000030", "step-000000000040", "step-000000000050"]);
+    assert_eq!(run.names(), ["step-000000000030", "step-000000000040", "step-000000000050"]);
 }
 
 #[test]
@@ -118,9 +138,13 @@ fn a_damaged_newest_is_reported_and_the_one_before_is_used() {
         fs::write(&path, bytes).unwrap();
         let loaded = run.load().unwrap().unwrap();
         assert_eq!(loaded.state, run.state(10), "{name}");
-        assert!(loaded.damaged[0].to_string().contains("was altered"), "{name}: {}", loaded.damaged[0]);
-        fs::remove_file(&path).unwrap();
-        assert!(run.load().unwrap().unwrap().damaged[0].to_string().contains("No such file"), "{name}");
+        let [warning] = &loaded.warnings[..] else { panic!("{:?}", loaded.warnings) };
+        let said = ["a checkpoint is damaged, the one at 10 steps is used", "was altered", "20.damaged now"];
+        assert!(said.iter().all(|part| warning.contains(part)), "{name}: {warning}");
+        assert_eq!(run.names(), ["step-000000000010"], "it does not count any more");
+
+        fs::remove_file(run.save(30).join(name)).unwrap();
+        assert!(run.load().unwrap().unwrap().warnings[0].contains("No such file"), "{name}");
     }
 }
 
@@ -137,8 +161,8 @@ fn a_manifest_that_was_rewritten_with_its_sum_is_refused_for_what_it_says() {
     fs::write(newest.join(SUMS), sums.replace(&sum(&manifest), &sum(&rewritten))).unwrap();
     let loaded = run.load().unwrap().unwrap();
     assert_eq!(loaded.state, run.state(10));
-    let message = loaded.damaged[0].to_string();
-    assert!(message.ends_with("checkpoint.json: 11 updates are more than 10 batches"), "{message}");
+    let message = &loaded.warnings[0];
+    assert!(message.contains("checkpoint.json: 11 updates are more than 10 batches"), "{message}");
 }
 
 #[test]
@@ -149,7 +173,7 @@ fn what_was_half_written_is_nothing() {
     fs::create_dir(&partial).unwrap();
     fs::write(partial.join(WEIGHTS), "half").unwrap();
     let loaded = run.load().unwrap().unwrap();
-    assert_eq!((loaded.state, loaded.damaged.len()), (run.state(10), 0));
+    assert_eq!((loaded.state, loaded.warnings.len()), (run.state(10), 0));
     run.save(20);
     assert_eq!(run.load().unwrap().unwrap().state, run.state(20));
 }
@@ -162,4 +186,191 @@ fn never_a_silent_fresh_start() {
     }
     let message = run.load().unwrap_err().to_string();
     assert!(message.contains("no checkpoint in") && message.contains("step-000000000020"), "{message}");
+}
+
+#[test]
+fn a_run_whose_checkpoints_are_gone_is_no_new_run() {
+    let gone = "this run has written some (the newest: step-000000000020); put them back, or begin a new run";
+    for keep_latest in [false, true] {
+        let run = run();
+        [10, 20].into_iter().for_each(|env_steps| fs::remove_dir_all(run.save(env_steps)).unwrap());
+        if !keep_latest {
+            fs::remove_file(run.run_dir.checkpoints().join(LATEST)).unwrap();
+        }
+        assert!(run.refusal().contains(gone), "{}", run.refusal());
+        // Each trace alone tells of them.
+        fs::remove_file(run.run_dir.root().join("checkpoints.json")).unwrap();
+        match keep_latest {
+            true => assert!(run.refusal().contains(gone), "{}", run.refusal()),
+            false => {
+                assert!(run.load().unwrap().is_none(), "nothing tells of them any more");
+                fs::write(run.run_dir.summary(), "{}").unwrap();
+                assert!(run.refusal().contains("summary.json tells of it"), "{}", run.refusal());
+            }
+        }
+        fs::remove_dir_all(run.run_dir.checkpoints()).unwrap();
+        fs::write(run.run_dir.root().join("checkpoints.json"), "{").unwrap();
+        assert!(run.refusal().contains("checkpoints.json tells of it"), "{}", run.refusal());
+    }
+}
+
+#[test]
+fn a_checkpoint_of_another_run_or_of_other_settings_is_refused_and_nothing_is_touched() {
+    let (run, other) = (run(), run());
+    let mine = run.save(20);
+    let theirs = other.save(10);
+    let foreign = run.run_dir.checkpoints().join(theirs.file_name().unwrap());
+    fs::rename(theirs, &foreign).unwrap();
+    let message = run.refusal();
+    assert!(message.contains("step-000000000010: it is of another run"), "{message}");
+    assert!(foreign.exists() && mine.exists());
+    fs::remove_dir_all(foreign).unwrap();
+
+    let mut edited = run;
+    edited.config.seed = RunSeed(9);
+    let message = edited.refusal();
+    assert!(
+        message.contains("step-000000000020: it was trained with seed = 1, config.toml says 9"),
+        "{message}"
+    );
+    edited.config.seed = RunSeed(1);
+    edited.config.algorithm.gamma = 0.5;
+    assert!(
+        edited.refusal().contains("algorithm.gamma = 0.99, config.toml says 0.5"),
+        "{}",
+        edited.refusal()
+    );
+    edited.config.algorithm.gamma = 0.99;
+    // What can change while a learner runs may have changed since.
+    edited.config.algorithm.epsilon_finish = 0.25;
+    let warnings = edited.load().unwrap().unwrap().warnings;
+    assert!(
+        warnings[0].starts_with("algorithm.epsilon_finish is 0.25 from here on, it was 0.05"),
+        "{warnings:?}"
+    );
+}
+
+#[test]
+fn fewer_steps_than_are_done_are_refused_and_as_many_are_not() {
+    let mut run = run();
+    run.save(400);
+    // Its last batch went from 398 to 400.
+    for (t_max, accepted) in [(399, true), (400, true), (1000, true), (398, false), (5, false)] {
+        run.config.training.t_max = t_max;
+        assert_eq!(run.load().is_ok(), accepted, "{t_max}");
+    }
+    assert!(
+        run.refusal().starts_with("training.t_max = 5, and 400 steps are done already"),
+        "{}",
+        run.refusal()
+    );
+}
+
+#[test]
+fn a_renamed_copy_is_not_the_newest_and_evicts_nobody() {
+    let run = run();
+    let real = run.save(10);
+    let copy = run.run_dir.checkpoints().join("step-999999999999");
+    fs::create_dir(&copy).unwrap();
+    for entry in fs::read_dir(&real).unwrap() {
+        let path = entry.unwrap().path();
+        fs::copy(&path, copy.join(path.file_name().unwrap())).unwrap();
+    }
+    let loaded = run.load().unwrap().unwrap();
+    assert_eq!((loaded.state, loaded.folder), (run.state(10), real.clone()));
+    assert!(loaded.warnings[0].contains("holds the checkpoint at 10 steps and is called otherwise"));
+    run.save_and_keep(20, 1);
+    assert_eq!(run.names(), ["step-000000000020", "step-999999999999"], "it is left alone");
+    assert_eq!(run.load().unwrap().unwrap().state, run.state(20));
+    fs::remove_dir_all(run.run_dir.checkpoints().join("step-000000000020")).unwrap();
+    assert!(run.refusal().contains("is called otherwise"), "{}", run.refusal());
+}
+
+#[test]
+fn with_one_kept_the_last_good_one_survives_a_damaged_newest() {
+    let run = run();
+    run.save_and_keep(10, 2);
+    fs::write(run.save_and_keep(20, 2).join(STATE), "damaged").unwrap();
+    assert_eq!(run.load().unwrap().unwrap().state, run.state(10));
+    // Training goes on from 10, and its next checkpoint comes before the step of the damaged one.
+    run.save_and_keep(15, 1);
+    assert_eq!(run.names(), ["step-000000000015"]);
+    assert_eq!(run.load().unwrap().unwrap().state, run.state(15));
+}
+
+#[test]
+fn what_a_person_put_there_is_not_read_for_ever() {
+    let run = run();
+    run.save(10);
+    let newest = run.save(20);
+    fs::remove_file(newest.join(WEIGHTS)).unwrap();
+    symlink("/dev/zero", newest.join(WEIGHTS)).unwrap();
+    let loaded = run.load().unwrap().unwrap();
+    assert_eq!(loaded.state, run.state(10));
+    assert!(loaded.warnings[0].contains("it is no regular file"), "{:?}", loaded.warnings);
+}
+
+/// Whoever looks at any moment, as a learner does that is started after a kill at that moment, finds a checkpoint.
+#[test]
+fn at_every_moment_of_repeating_a_checkpoint_there_is_one() {
+    let run = run();
+    run.save(100);
+    let latest = run.run_dir.checkpoints().join(LATEST);
+    let done = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        let looking = scope.spawn(|| {
+            let mut seen = BTreeSet::new();
+            while !done.load(Ordering::Relaxed) {
+                let target = fs::read_link(&latest).unwrap();
+                // The old one goes once the link leads to the new one.
+                let manifest = fs::read(run.run_dir.checkpoints().join(&target).join(MANIFEST));
+                assert!(
+                    manifest.is_ok() || fs::read_link(&latest).unwrap() != target,
+                    "{}",
+                    target.display()
+                );
+                seen.insert(target);
+            }
+            seen.len()
+        });
+        (0..40).for_each(|_| drop(run.save(100)));
+        done.store(true, Ordering::Relaxed);
+        assert!(looking.join().unwrap() > 1, "it looked while they were written");
+    });
+    assert_eq!(run.names(), ["step-000000000100-41"], "one of each step is kept");
+    assert_eq!(run.load().unwrap().unwrap().state, run.state(100));
+}
+
+#[test]
+fn wherever_writing_was_cut_short_the_next_learner_goes_on() {
+    let all = |run: &Run| run.run_dir.checkpoints();
+    let cut: [fn(&Path); 4] = [
+        // Written, not renamed.
+        |all| fs::rename(all.join("step-000000000100-2"), all.join("step-000000000100-2.partial")).unwrap(),
+        // Renamed, and the link still leads to the one before.
+        |all| {
+            fs::remove_file(all.join(LATEST)).unwrap();
+            symlink("step-000000000100", all.join(LATEST)).unwrap();
+        },
+        // The first one of the run, not yet remembered.
+        |all| fs::remove_file(all.join("../checkpoints.json")).unwrap(),
+        // Linked, and the one before still there: as it lies.
+        |_| (),
+    ];
+    for cut in cut {
+        let run = run();
+        let before = run.save(100);
+        let copy = all(&run).join("copy");
+        fs::rename(&before, &copy).unwrap();
+        fs::create_dir(&before).unwrap();
+        run.save(100);
+        fs::remove_dir_all(&before).ok();
+        fs::rename(&copy, &before).unwrap();
+        cut(&all(&run));
+        assert_eq!(run.load().unwrap().unwrap().state, run.state(100));
+        run.save(100);
+        run.save(200);
+        assert_eq!(run.load().unwrap().unwrap().state, run.state(200));
+        assert!(!all(&run).join("step-000000000100-2.partial").exists());
+    }
 }

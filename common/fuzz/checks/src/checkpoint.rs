@@ -9,7 +9,7 @@ use rit_episode::{
     wire::{Expected, Header, PayloadLayout},
 };
 use rit_learner::{
-    checkpoint::{self, Manifest, Progress, SnapshotMark, TrainingState},
+    checkpoint::{self, Manifest, Origin, Progress, SnapshotMark, TrainingState},
     evaluation::Exploring,
     ledger::{Ledger, Terms},
     replay_log::ReplayLog,
@@ -91,7 +91,8 @@ impl Run {
         for episode in &episodes {
             log.append(episode)?;
         }
-        checkpoint::save(&run_dir, &model, &state(&*learner(&model, &config)?, &config), 1)?;
+        let origin = Origin::of(&run_dir, &config)?;
+        checkpoint::save(&run_dir, &model, &state(&*learner(&model, &config)?, &config, origin), 1)?;
         let whole = FILES.map(|name| fs::read(path(&run_dir, name)).unwrap_or_default());
         Ok(Self { _folder: folder, run_dir, config, model, expected, next, whole })
     }
@@ -197,7 +198,7 @@ fn learner(model: &Arc<Model>, config: &Config) -> Result<Box<dyn Learner>, Box<
     Ok(rit_algo::learner(Arc::clone(model), config.update(), params)?)
 }
 
-fn state(learner: &dyn Learner, config: &Config) -> TrainingState {
+fn state(learner: &dyn Learner, config: &Config, origin: Origin) -> TrainingState {
     let params = learner.params().to_vec();
     let acting = &params[learner.model().acting()];
     let lag = config.algorithm.policy_lag as u64;
@@ -207,6 +208,8 @@ fn state(learner: &dyn Learner, config: &Config) -> TrainingState {
             .map(|version| Snapshot::new(version, 2 * version, acting))
             .collect(),
         manifest: Manifest {
+            origin,
+            env_steps_before: 2 * EPISODES - 2,
             progress: Progress { env_steps: 2 * EPISODES, episodes: EPISODES, updates: UPDATES },
             target_copied_at: 2,
             terms: (UPDATES - lag..=UPDATES)

@@ -1,0 +1,114 @@
+//! Which checkpoint training goes on from.
+
+use super::{
+    CheckpointError, Manifest, Origin, OtherOrigin, TrainingState, folders, load, load_manifest, written,
+};
+use crate::replay_log;
+use rit_algo::Learner;
+use rit_config::{Config, RunDir};
+use rit_episode::{Episode, wire::Expected};
+use std::path::{Path, PathBuf};
+
+/// A checkpoint that training goes on from.
+#[derive(Debug)]
+pub struct Loaded {
+    /// Its folder.
+    pub folder: PathBuf,
+    /// All but replay.
+    pub state: TrainingState,
+    /// Replay, oldest first.
+    pub replay: Vec<Episode>,
+    /// What somebody should know of: newer ones that could not be used, settings that have changed.
+    pub warnings: Vec<String>,
+}
+
+/// The newest checkpoint that is whole, with replay's last episodes; `None` for a run that has never
+/// written one. Newer ones that are damaged are set aside, so that they do not count any more.
+///
+/// # Errors
+/// When there are checkpoints and none can be used, when there were and they are gone, when one is of another run or
+/// was trained otherwise, or when it has more steps than the run shall make. Then nothing has been changed.
+pub fn load_newest(
+    run_dir: &RunDir,
+    learner: &dyn Learner,
+    expected: &Expected,
+    config: &Config,
+) -> Result<Option<Loaded>, CheckpointError> {
+    let all = run_dir.checkpoints();
+    let origin = Origin::of(run_dir, config)?;
+    let (mut misnamed, mut damaged) = (Vec::new(), Vec::<(PathBuf, CheckpointError)>::new());
+    let mut candidates = Vec::new();
+    for folder in folders::list(&all)?.into_iter().rev() {
+        match load_manifest(&folder.path) {
+            Ok(manifest) => {
+                let changed = check_origin(&origin, &folder.path, &manifest)?;
+                let env_steps = manifest.progress.env_steps;
+                if env_steps == folder.env_steps {
+                    candidates.push((folder.path, Ok(changed)));
+                } else {
+                    misnamed.push(CheckpointError::Misnamed { folder: folder.path, env_steps });
+                }
+            }
+            Err(error) => candidates.push((folder.path, Err(error))),
+        }
+    }
+    for (folder, manifest) in candidates {
+        let loaded = manifest
+            .and_then(|changed| Ok((changed, load_whole(&folder, run_dir, learner, expected, config)?)));
+        match loaded {
+            Ok((changed, (state, replay))) => {
+                check_steps(&state.manifest, config)?;
+                let mut warnings: Vec<String> = misnamed.iter().map(ToString::to_string).collect();
+                warnings.extend(changed);
+                let env_steps = state.manifest.progress.env_steps;
+                warnings.extend(damaged.iter().map(|(path, error)| set_aside(path, error, env_steps)));
+                return Ok(Some(Loaded { folder, state, replay, warnings }));
+            }
+            Err(error) => damaged.push((folder, error)),
+        }
+    }
+    if let Some(newest) = damaged.into_iter().map(|(_, error)| error).chain(misnamed).next() {
+        return Err(CheckpointError::NoneUsable { folder: all, newest: Box::new(newest) });
+    }
+    match written::newest(run_dir) {
+        Some(newest) => Err(CheckpointError::Gone { folder: all, newest }),
+        None => Ok(None),
+    }
+}
+
+/// The settings that have changed since, in words.
+fn check_origin(origin: &Origin, folder: &Path, manifest: &Manifest) -> Result<Vec<String>, CheckpointError> {
+    let other = |what: OtherOrigin| CheckpointError::Other { folder: folder.to_owned(), what };
+    origin.may_go_on_from(&manifest.origin).map_err(other)
+}
+
+/// A run that its last batch has brought beyond `t_max` is over. One that was there before wants fewer steps than it
+/// has.
+fn check_steps(manifest: &Manifest, config: &Config) -> Result<(), CheckpointError> {
+    let (t_max, before) = (config.training.t_max, manifest.env_steps_before);
+    if before > 0 && t_max <= before {
+        return Err(CheckpointError::StepsDone { t_max, env_steps: manifest.progress.env_steps });
+    }
+    Ok(())
+}
+
+fn load_whole(
+    folder: &Path,
+    run_dir: &RunDir,
+    learner: &dyn Learner,
+    expected: &Expected,
+    config: &Config,
+) -> Result<(TrainingState, Vec<Episode>), CheckpointError> {
+    let state = load(folder, learner, expected.tasks.len(), &config.algorithm)?;
+    let end = state.manifest.progress.episodes;
+    let numbers = end.saturating_sub(config.replay_episodes() as u64)..end;
+    let replay = replay_log::read(&run_dir.replay(), expected, numbers)?;
+    Ok((state, replay))
+}
+
+/// Takes a damaged checkpoint out of the count; what is said of it.
+fn set_aside(folder: &Path, error: &CheckpointError, used: u64) -> String {
+    let place = folders::set_aside(folder);
+    let place = place.map_or_else(String::new, |place| format!("; it lies in {} now", place.display()));
+    format!("a checkpoint is damaged, the one at {used} steps is used: {error}{place}")
+}
