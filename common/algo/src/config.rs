@@ -1,9 +1,10 @@
 //! A model's configuration: its method, and every size that a method may ask for.
 
 use crate::{
-    Method, Mixing, RitConfig, TaskRepresentations,
-    method::{self, Encoder},
+    Method, TerminalStates,
+    method::{Encoder, Mixing},
 };
+use rit_nn::OptimizerKind;
 
 /// What a [`Model`](crate::Model) is made from. A method takes the sizes that it has a use for.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -68,39 +69,54 @@ impl ModelConfig {
     /// # Errors
     /// The first thing that no model can have.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        if !self.is_rit() {
+        let facts = self.method.facts();
+        if !facts.built {
             return Err(ConfigError::NotBuilt { method: self.method });
         }
-        self.rit().validate()
-    }
-
-    /// Whether RIT's networks make this model.
-    fn is_rit(&self) -> bool {
-        let facts = self.method.facts();
-        facts.encoder == Encoder::Beside
-            || self.encoder == Encoder::Beside && matches!(self.method, Method::QmixInt | Method::VdnInt)
-    }
-
-    /// Sizes and parts of RIT's networks.
-    pub(crate) fn rit(&self) -> RitConfig {
-        let facts = self.method.facts();
-        RitConfig {
-            entity_dim: self.entity_dim,
-            n_actions: self.n_actions,
-            hidden_dim: self.hidden_dim,
-            attention_dim: self.attention_dim,
-            n_heads: self.n_heads,
-            task_representations: facts.task_representations.then_some(TaskRepresentations {
-                dim: self.task_representation_dim,
-                reward_embed_dim: self.reward_embed_dim,
-            }),
-            mixing: match facts.mixing {
-                Some(method::Mixing::Network) => Mixing::Network {
-                    mixing_embed_dim: self.mixing_embed_dim,
-                    hypernet_embed_dim: self.hypernet_embed_dim,
-                },
-                _ => Mixing::Sum,
-            },
+        let mut sizes = vec![
+            ("entity_dim", self.entity_dim),
+            ("n_actions", self.n_actions),
+            ("hidden_dim", self.hidden_dim),
+            ("attention_dim", self.attention_dim),
+            ("n_heads", self.n_heads),
+        ];
+        if facts.task_representations {
+            sizes.extend([
+                ("task_representation_dim", self.task_representation_dim),
+                ("reward_embed_dim", self.reward_embed_dim),
+            ]);
         }
+        if facts.mixing == Some(Mixing::Network) {
+            sizes.extend([
+                ("mixing_embed_dim", self.mixing_embed_dim),
+                ("hypernet_embed_dim", self.hypernet_embed_dim),
+            ]);
+        }
+        if let Some((name, _)) = sizes.into_iter().find(|(_, size)| *size == 0) {
+            return Err(ConfigError::Zero { name });
+        }
+        if !self.attention_dim.is_multiple_of(self.n_heads) {
+            return Err(ConfigError::Heads { attention_dim: self.attention_dim, n_heads: self.n_heads });
+        }
+        Ok(())
     }
+}
+
+/// Constants of the update.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct UpdateConfig {
+    /// γ.
+    pub gamma: f32,
+    /// Learning rate.
+    pub lr: f32,
+    /// Which optimiser.
+    pub optimizer: OptimizerKind,
+    /// Gradients are scaled down to this norm.
+    pub grad_norm_clip: f64,
+    /// Parts the batch is cut into; at least 1. Part of the result.
+    pub shards: usize,
+    /// Threads that work on them; at least 1. Not part of the result.
+    pub threads: usize,
+    /// Whether states that no target needs are worked on. Not part of the result.
+    pub terminal_states: TerminalStates,
 }

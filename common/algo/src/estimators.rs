@@ -4,5 +4,6 @@ pub mod dissimilarity;
 pub mod gae;
 pub mod ppo;
 pub mod roles;
+pub mod td;
 pub mod value_loss;
 pub mod value_norm;

@@ -1,37 +1,27 @@
-//! RIT: representing interactions and tasks. This crate knows no transport and does no IO.
+//! RIT, representing interactions and tasks, and the algorithms that it is compared with. This crate knows no transport
+//! and does no IO.
 //!
 //! - [`Method`]: the algorithms there are. [`Model`]: one's networks. [`Learner`]: one under training, and all that
 //!   a trainer knows of it. [`Acting`]: its networks choosing joint actions.
 //! - [`Rows`]: the rows of a batch that exist, in the order the networks work on them.
-//! - [`Rit`]: RIT's parts and the layout of its parameters; [`RitConfig`] says which parts it has.
-//! - [`encoder`], [`utility`], [`decoder`], [`task_encoder`], [`mixer`], [`contrastive`]: the parts, each
-//!   forward with its backward below it.
+//! - [`blocks`]: the parts of networks. [`methods`]: networks put together of them, a method or a family in a file.
+//! - [`drive`]: shards, threads, sums, objectives, the optimiser's step, and acting: what is the same for all.
 //! - [`on_policy`]: proximal policy optimisation, for [`Mappo`] and [`Mat`].
-//! - [`Update`]: one training step, from a batch of episodes to new weights.
-//! - [`RitActing`]: the same networks choosing joint actions, one row after another.
+//! - [`estimators`]: targets, losses and their gradients, as pure functions.
 
-mod acting;
+pub mod blocks;
 mod config;
-pub mod contrastive;
-pub mod decoder;
-pub mod encoder;
+pub mod drive;
 pub mod estimators;
 pub mod flat;
 pub mod learner;
 pub mod method;
-mod methods;
-pub mod mixer;
+pub mod methods;
 mod model;
 pub mod on_policy;
-mod rit;
 mod rows;
-pub mod task_encoder;
-pub mod td;
-mod update;
-pub mod utility;
 
-pub use acting::RitActing;
-pub use config::{ConfigError, ModelConfig};
+pub use config::{ConfigError, ModelConfig, UpdateConfig};
 pub use learner::Learner;
 pub use method::{Method, Regime};
 pub use methods::{
@@ -40,6 +30,4 @@ pub use methods::{
     mat::{Mat, MatActing, MatConfig},
 };
 pub use model::Model;
-pub use rit::{Mixing, Networks, Rit, RitConfig, TaskRepresentations};
 pub use rows::{Rows, Step, TerminalStates};
-pub use update::{Losses, Seen, Update, UpdateConfig};

@@ -2,9 +2,15 @@
 
 pub mod mappo;
 pub mod mat;
-mod rit;
+mod recurrent;
 
-use crate::{Learner, Model, RitActing, UpdateConfig, model::Network};
+pub use recurrent::Recurrent;
+
+use crate::{
+    Learner, Model, UpdateConfig,
+    drive::{TdLearner, ValueActing},
+    model::Network,
+};
 use rayon::ThreadPoolBuildError;
 use rit_episode::{Policy, Turn};
 use std::sync::Arc;
@@ -22,9 +28,9 @@ pub fn learner(
     params: Vec<f32>,
 ) -> Result<Box<dyn Learner>, ThreadPoolBuildError> {
     match &model.network {
-        Network::Rit(rit) => {
-            let rit = Arc::clone(rit);
-            Ok(Box::new(rit::RitLearner::new(model, rit, update, params)?))
+        Network::Recurrent(network) => {
+            let network = Arc::clone(network);
+            Ok(Box::new(TdLearner::new(model, network, update, params)?))
         }
     }
 }
@@ -48,7 +54,7 @@ impl Acting {
     /// When there are not as many as acting needs.
     pub fn new(model: &Model, params: &[f32]) -> Self {
         match &model.network {
-            Network::Rit(rit) => Self(Box::new(RitActing::new(Arc::clone(rit), params))),
+            Network::Recurrent(network) => Self(Box::new(ValueActing::new(Arc::clone(network), params))),
         }
     }
 

@@ -1,6 +1,6 @@
 //! A method's networks: which parameters they have, and which of these acting needs.
 
-use crate::{ConfigError, Method, ModelConfig, Rit};
+use crate::{ConfigError, Method, ModelConfig, drive::ValueNetwork as _, methods::Recurrent};
 use rit_episode::Rng;
 use rit_nn::Layout;
 use std::{ops::Range, sync::Arc};
@@ -15,8 +15,8 @@ pub struct Model {
 /// Whose networks they are.
 #[derive(Clone, Debug)]
 pub(crate) enum Network {
-    /// RIT's and its ablations'.
-    Rit(Arc<Rit>),
+    /// RIT's, its ablations' and those of the rivals that differ from it in one part.
+    Recurrent(Arc<Recurrent>),
 }
 
 impl Model {
@@ -26,7 +26,7 @@ impl Model {
     /// When there is no such model.
     pub fn new(config: ModelConfig) -> Result<Self, ConfigError> {
         config.validate()?;
-        let network = Network::Rit(Arc::new(Rit::new(config.rit())?));
+        let network = Network::Recurrent(Arc::new(Recurrent::new(&config)));
         Ok(Self { config, network })
     }
 
@@ -43,14 +43,14 @@ impl Model {
     /// Names and shapes of all parameters.
     pub fn layout(&self) -> &Layout {
         match &self.network {
-            Network::Rit(rit) => &rit.layout,
+            Network::Recurrent(network) => &network.parts().layout,
         }
     }
 
     /// The parameters that acting needs.
     pub fn acting(&self) -> Range<usize> {
         match &self.network {
-            Network::Rit(rit) => rit.acting(),
+            Network::Recurrent(network) => network.parts().acting.clone(),
         }
     }
 

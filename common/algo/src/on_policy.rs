@@ -13,7 +13,9 @@ pub(crate) use learner::measures;
 pub use loss::Sums;
 pub use targets::{Said, Targets};
 
-use crate::{Rows, TerminalStates, decoder::best, estimators::value_norm::ValueNorm, learner::Measure};
+use crate::{
+    Rows, TerminalStates, blocks::decoder::best, estimators::value_norm::ValueNorm, learner::Measure,
+};
 use loss::Counts;
 use rand::{Rng, seq::SliceRandom as _};
 use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder, prelude::*};

@@ -41,7 +41,11 @@ pub struct Rows {
     pub group_times: Vec<usize>,
     /// Features, `[entity rows, d]`.
     pub entities: Vec<f32>,
-    /// Which of the group's entities each agent sees, itself left out: the groups' `[n, m]` one after another.
+    /// The entity row of each agent row.
+    pub agent_entities: Vec<usize>,
+    /// Which of the group's entities each agent sees: the groups' `[n, m]` one after another.
+    pub observable: Vec<u8>,
+    /// The same with each agent itself left out.
     pub others: Vec<u8>,
     /// Which actions each agent may take, `[agent rows, A]`.
     pub available: Vec<u8>,
@@ -168,6 +172,8 @@ impl Rows {
         self.agent_times.clear();
         self.group_times.clear();
         self.entities.clear();
+        self.agent_entities.clear();
+        self.observable.clear();
         self.others.clear();
         self.available.clear();
         self.actions.clear();
@@ -201,6 +207,7 @@ impl Rows {
 
     fn push_group(&mut self, n_agents: usize, n_entities: usize, step: Step, previous_reward: f32) {
         let (agents, entities) = (self.agent_rows(), self.entity_rows());
+        self.agent_entities.extend(entities..entities + n_agents);
         self.groups.push(Group { queries: agents..agents + n_agents, keys: entities..entities + n_entities });
         self.steps.push(step);
         self.previous_rewards.push(previous_reward);
@@ -209,6 +216,7 @@ impl Rows {
     fn push_state(&mut self, n_agents: usize, n_entities: usize, entities: &[f32], observable: &[u8]) {
         self.entity_dim = entities.len() / n_entities;
         self.entities.extend_from_slice(entities);
+        self.observable.extend_from_slice(observable);
         let first = self.others.len();
         self.others.extend_from_slice(observable);
         for agent in 0..n_agents {
@@ -266,6 +274,8 @@ mod tests {
         assert_eq!(rows.entities, entities.map(|x| x as f32));
         assert_eq!(rows.previous_rewards, [0.0, 0.0, 1.0, 1.0, 2.0]);
         assert_eq!(rows.others[..8], [0, 1, 1, 1, 0, 1, 0, 1]);
+        assert_eq!(rows.observable, [1; 22]);
+        assert_eq!(rows.agent_entities, [0, 1, 3, 5, 6, 8, 10, 11]);
         let next: Vec<_> = (0..5).map(|group| rows.next_group(group)).collect();
         assert_eq!(next, [Some(2), Some(3), Some(4), None, None]);
         // The contrastive order is the batch's: short's one row, then long's four.

@@ -6,49 +6,29 @@
 
 #[path = "golden/on_policy.rs"]
 mod on_policy;
+#[path = "golden/value.rs"]
+mod value;
 
-use rit_algo::{
-    Losses, Mixing, Rit, RitConfig, Seen, TaskRepresentations, TerminalStates, Update, UpdateConfig,
-};
+use rit_algo::TerminalStates;
 use rit_episode::{End, Episode, decision_order};
 use rit_nn::{Layout, Optimizer, OptimizerKind, optimizer};
 use safetensors::SafeTensors;
 use serde::Deserialize;
 use std::{
-    collections::HashMap,
     fs,
     path::{Path, PathBuf},
-    sync::{Arc, Mutex},
 };
 
-/// Which algorithm a case is of: RIT where it does not say.
+/// Which algorithm a case is of: at the top or in its configuration; RIT where it does not say.
 #[derive(Deserialize)]
 struct Algorithm {
     algorithm: Option<String>,
+    config: AlgorithmConfig,
 }
 
 #[derive(Deserialize)]
-struct Case {
-    config: Sizes,
-    gamma: f32,
-    grad_norm_clip: f64,
-    optimizer: OptimizerConfig,
-    scalars: Scalars,
-}
-
-#[derive(Deserialize)]
-struct Sizes {
-    entity_dim: usize,
-    n_actions: usize,
-    agents_max: usize,
-    entities_max: usize,
-    hidden_dim: usize,
-    attention_dim: usize,
-    n_heads: usize,
-    task_representation_dim: usize,
-    reward_embed_dim: usize,
-    mixing_embed_dim: usize,
-    hypernet_embed_dim: usize,
+struct AlgorithmConfig {
+    algorithm: Option<String>,
 }
 
 #[derive(Deserialize)]
@@ -71,14 +51,6 @@ impl OptimizerConfig {
     }
 }
 
-#[derive(Deserialize)]
-struct Scalars {
-    td_loss: f64,
-    contrastive_loss: f64,
-    loss: f64,
-    grad_norm: f64,
-}
-
 #[test]
 fn every_case_agrees_with_the_reference() {
     let root = std::env::var_os("RIT_GOLDEN_DIR")
@@ -97,11 +69,15 @@ fn every_case_agrees_with_the_reference() {
             let case = format!("{}, {shards} shards, terminal states {terminal_states:?}", folder.display());
             let mut report = Report { case, differences: vec![] };
             let bytes = fs::read(folder.join("case.json")).unwrap();
-            match serde_json::from_slice::<Algorithm>(&bytes).unwrap().algorithm.as_deref() {
+            let case: Algorithm = serde_json::from_slice(&bytes).unwrap();
+            match case.algorithm.or(case.config.algorithm).as_deref() {
                 Some(algorithm @ ("mappo" | "mat")) => {
                     on_policy::compare(folder, algorithm, shards, terminal_states, &mut report);
                 }
-                _ => compare(folder, shards, terminal_states, &mut report),
+                algorithm => {
+                    let algorithm = algorithm.unwrap_or("rit");
+                    value::compare(folder, algorithm, shards, terminal_states, &mut report);
+                }
             }
             println!("{}: {} differences", report.case, report.differences.len());
             differences.extend(report.differences);
@@ -110,173 +86,23 @@ fn every_case_agrees_with_the_reference() {
     assert!(differences.is_empty(), "{} differences:\n{}", differences.len(), differences.join("\n"));
 }
 
-fn compare(folder: &Path, shards: usize, terminal_states: TerminalStates, report: &mut Report) {
-    let case: Case = serde_json::from_slice(&fs::read(folder.join("case.json")).unwrap()).unwrap();
-    let read = |name: &str| Tensors(fs::read(folder.join(name).with_extension("safetensors")).unwrap());
-    let (batch, expected, gradients) = (read("batch"), read("expected"), read("gradients"));
-    let sizes = &case.config;
-    let rit = Rit::new(RitConfig {
-        entity_dim: sizes.entity_dim,
-        n_actions: sizes.n_actions,
-        hidden_dim: sizes.hidden_dim,
-        attention_dim: sizes.attention_dim,
-        n_heads: sizes.n_heads,
-        task_representations: Some(TaskRepresentations {
-            dim: sizes.task_representation_dim,
-            reward_embed_dim: sizes.reward_embed_dim,
-        }),
-        mixing: Mixing::Network {
-            mixing_embed_dim: sizes.mixing_embed_dim,
-            hypernet_embed_dim: sizes.hypernet_embed_dim,
-        },
-    });
-    let rit = Arc::new(rit.unwrap());
-    let (kind, lr) = case.optimizer.kind();
-    let config = UpdateConfig {
-        gamma: case.gamma,
-        lr,
-        optimizer: kind,
-        grad_norm_clip: case.grad_norm_clip,
-        shards,
-        threads: 2,
-        terminal_states,
-    };
-    let weights = flat(&rit.layout, &read("weights"), 0..rit.layout.len());
-    let mut update = Update::new(Arc::clone(&rit), config, weights.clone()).unwrap();
-    update.target = flat(&rit.layout, &read("target_weights"), rit.target());
-
-    let cells = Cells::read(&batch, sizes.padding());
-    let episodes: Vec<Episode> = (0..cells.episodes()).map(|index| cells.episode(&batch, index)).collect();
-    let pairing: Vec<usize> = batch.i32("pairing").iter().map(|&row| row as usize).collect();
-    let said = Mutex::new(HashMap::new());
-    let losses = update.gradients_seen(
-        &episodes.iter().collect::<Vec<_>>(),
-        |rows| {
-            assert_eq!(rows, pairing.len(), "one pair for each filled agent row");
-            pairing
-        },
-        |states| {
-            said.lock().unwrap().extend(states.map(|seen| ((seen.episode, seen.time), Said::new(&seen))));
-        },
-    );
-
-    compare_losses(&losses, &case.scalars, report);
-    // What training leaves out cannot be compared one by one: losses and gradients show that it does not count.
-    if terminal_states == TerminalStates::Kept {
-        compare_networks(&said.into_inner().unwrap(), &cells, sizes, &expected, report);
-    }
-    for param in rit.layout.params() {
-        let name = format!("gradient of {}", param.name);
-        report.gradients(&name, &update.grads()[param.range.clone()], &gradients.f32(&param.name));
-    }
-
-    // The optimiser, fed with the stored gradients.
-    let stored = flat(&rit.layout, &gradients, 0..rit.layout.len());
-    let scale = optimizer::clip_scale(optimizer::sum_of_squares(&stored).sqrt(), case.grad_norm_clip);
-    let mut stepped = weights;
-    Optimizer::new(kind, lr, stepped.len()).step(&mut stepped, &stored, scale);
-    let after = read("weights_after_step");
-    for param in rit.layout.params() {
-        let name = format!("{} after one step", param.name);
-        report.values(&name, &stepped[param.range.clone()], &after.f32(&param.name));
-    }
-}
-
-fn compare_losses(losses: &Losses, scalars: &Scalars, report: &mut Report) {
-    let pairs = [
-        ("td_loss", losses.td_loss, scalars.td_loss),
-        ("contrastive_loss", losses.contrastive_loss, scalars.contrastive_loss),
-        ("loss", losses.td_loss + losses.contrastive_loss, scalars.loss),
-        ("grad_norm", losses.grad_norm, scalars.grad_norm),
-    ];
-    for (name, ours, theirs) in pairs {
-        report.values(name, &[ours as f32], &[theirs as f32]);
-    }
-}
-
-/// What the networks said in one state.
-struct Said {
-    history: Vec<f32>,
-    task_representation: Vec<f32>,
-    utilities: Vec<f32>,
-    greedy_actions: Vec<u8>,
-    q_total: f32,
-    target_q_total: f32,
-    td_target: f32,
-}
-
-impl Said {
-    fn new(seen: &Seen<'_>) -> Self {
-        Self {
-            history: seen.history.to_vec(),
-            task_representation: seen.task_representation.to_vec(),
-            utilities: seen.utilities.to_vec(),
-            greedy_actions: seen.greedy_actions.to_vec(),
-            q_total: seen.q_total,
-            target_q_total: seen.target_q_total,
-            td_target: seen.td_target,
-        }
-    }
-}
-
-/// Compares what is filled and real. `said` by (episode, time).
-fn compare_networks(
-    said: &HashMap<(usize, usize), Said>,
-    cells: &Cells,
-    sizes: &Sizes,
-    expected: &Tensors,
+/// One clipped step from the stored gradients, where the case has one.
+fn compare_step(
+    folder: &Path,
+    layout: &Layout,
+    weights: &[f32],
+    (kind, lr): (OptimizerKind, f32),
+    grad_norm_clip: f64,
     report: &mut Report,
 ) {
-    let (h, z, a) = (sizes.hidden_dim, sizes.task_representation_dim, sizes.n_actions);
-    let mut tensors: [(&str, Vec<f32>, Vec<f32>); 7] = [
-        "history",
-        "task_representation",
-        "utilities",
-        "q_total",
-        "target_q_total",
-        "td_target",
-        "greedy_actions",
-    ]
-    .map(|name| (name, vec![], vec![]));
-    let greedy = expected.i32("greedy_actions");
-    for (episode, &steps) in cells.steps.iter().enumerate() {
-        for time in 0..steps {
-            let (now, next) = (&said[&(episode, time)], &said[&(episode, time + 1)]);
-            let cell = episode * cells.steps_max + time;
-            let state = episode * (cells.steps_max + 1) + time;
-            for (k, &row) in cells.agents[episode].iter().enumerate() {
-                let mut compare = |tensor: usize, ours: &[f32], cell: usize, width: usize| {
-                    let (name, all, reference) = &mut tensors[tensor];
-                    let theirs = expected.f32(name);
-                    all.extend_from_slice(&ours[k * width..][..width]);
-                    reference.extend_from_slice(&theirs[(cell * sizes.agents_max + row) * width..][..width]);
-                };
-                compare(0, &now.history, state, h);
-                compare(1, &now.task_representation, state, z);
-                compare(2, &now.utilities, cell, a);
-                tensors[6].1.push(f32::from(next.greedy_actions[k]));
-                tensors[6].2.push(greedy[cell * sizes.agents_max + row] as f32);
-            }
-            for (tensor, ours) in [(3, now.q_total), (4, next.target_q_total), (5, now.td_target)] {
-                tensors[tensor].1.push(ours);
-                let theirs = expected.f32(tensors[tensor].0)[cell];
-                tensors[tensor].2.push(theirs);
-            }
-        }
-    }
-    for (name, ours, theirs) in &tensors {
-        report.values(name, ours, theirs);
-    }
-}
-
-impl Sizes {
-    fn padding(&self) -> Padding {
-        Padding {
-            entity_dim: self.entity_dim,
-            n_actions: self.n_actions,
-            agents_max: self.agents_max,
-            entities_max: self.entities_max,
-        }
+    let Ok(after) = fs::read(folder.join("weights_after_step.safetensors")).map(Tensors) else { return };
+    let stored = flat(layout, &Tensors::read(folder, "gradients"), 0..layout.len());
+    let scale = optimizer::clip_scale(optimizer::sum_of_squares(&stored).sqrt(), grad_norm_clip);
+    let mut stepped = weights.to_vec();
+    Optimizer::new(kind, lr, stepped.len()).step(&mut stepped, &stored, scale);
+    for param in layout.params() {
+        let name = format!("{} after one step", param.name);
+        report.values(&name, &stepped[param.range.clone()], &after.f32(&param.name));
     }
 }
 
@@ -377,9 +203,8 @@ impl Cells {
 fn flat(layout: &Layout, tensors: &Tensors, range: std::ops::Range<usize>) -> Vec<f32> {
     let mut flat = Vec::new();
     for param in layout.params().iter().filter(|param| param.range.end <= range.end) {
-        let values = tensors.f32(&param.name);
-        assert_eq!(values.len(), param.range.len(), "{}", param.name);
-        flat.extend(values);
+        flat.extend(tensors.f32(&param.name));
+        assert_eq!(flat.len(), param.range.end, "{}", param.name);
     }
     flat
 }
@@ -388,6 +213,21 @@ fn flat(layout: &Layout, tensors: &Tensors, range: std::ops::Range<usize>) -> Ve
 struct Tensors(Vec<u8>);
 
 impl Tensors {
+    fn read(folder: &Path, name: &str) -> Self {
+        let path = folder.join(name).with_extension("safetensors");
+        Self(fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display())))
+    }
+
+    fn holds(&self, name: &str) -> bool {
+        SafeTensors::deserialize(&self.0).unwrap().tensor(name).is_ok()
+    }
+
+    /// Every tensor's name and shape.
+    fn shapes(&self) -> Vec<(String, Vec<usize>)> {
+        let tensors = SafeTensors::deserialize(&self.0).unwrap();
+        tensors.tensors().into_iter().map(|(name, tensor)| (name, tensor.shape().to_vec())).collect()
+    }
+
     fn words(&self, name: &str) -> Vec<[u8; 4]> {
         let tensors = SafeTensors::deserialize(&self.0).unwrap();
         let tensor = tensors.tensor(name).unwrap_or_else(|error| panic!("{name}: {error}"));

@@ -4,8 +4,11 @@
 
 use rand::RngExt as _;
 use rit_algo::{
-    Mixing, Rit, RitActing, RitConfig, Seen, TaskRepresentations, TerminalStates, Update, UpdateConfig,
-    contrastive::draw_pairing,
+    Method, Model, ModelConfig, TerminalStates, UpdateConfig,
+    blocks::draw_pairing,
+    drive::{SeenShard, TdLearner, ValueActing, ValueNetwork as _},
+    method::Encoder,
+    methods::Recurrent,
 };
 use rit_episode::{
     Choice, End, Episode, Exploration, Observation, Policy, Rng, RunSeed, Stream, Turn, decision_order,
@@ -19,21 +22,72 @@ use std::{
 const D: usize = 5;
 const A: usize = 3;
 
-fn config(n_heads: usize, task_representations: bool, mixing_network: bool) -> RitConfig {
-    RitConfig {
-        entity_dim: D,
-        n_actions: A,
-        hidden_dim: 6,
-        attention_dim: 4,
-        n_heads,
-        task_representations: task_representations
-            .then_some(TaskRepresentations { dim: 3, reward_embed_dim: 2 }),
-        mixing: if mixing_network {
-            Mixing::Network { mixing_embed_dim: 4, hypernet_embed_dim: 5 }
-        } else {
-            Mixing::Sum
-        },
+/// Every method of these networks, the encoder's option, and both numbers of heads.
+const CASES: [(Method, Encoder, usize); 9] = [
+    (Method::Rit, Encoder::Beside, 1),
+    (Method::Rit, Encoder::Beside, 2),
+    (Method::RitVdn, Encoder::Beside, 2),
+    (Method::RitNoTaskRepresentations, Encoder::Beside, 2),
+    (Method::QmixAttn, Encoder::Within, 2),
+    (Method::QmixAttn, Encoder::Beside, 1),
+    (Method::VdnAttn, Encoder::Within, 1),
+    (Method::QmixInt, Encoder::Within, 1),
+    (Method::VdnInt, Encoder::Within, 2),
+];
+
+/// A method's networks.
+struct Networks {
+    model: Arc<Model>,
+    network: Arc<Recurrent>,
+}
+
+impl Networks {
+    fn new((method, encoder, n_heads): (Method, Encoder, usize)) -> Self {
+        let config = ModelConfig {
+            method,
+            encoder,
+            entity_dim: D,
+            n_actions: A,
+            hidden_dim: 6,
+            attention_dim: 4,
+            n_heads,
+            task_representation_dim: 3,
+            reward_embed_dim: 2,
+            mixing_embed_dim: 4,
+            hypernet_embed_dim: 5,
+        };
+        let network = Arc::new(Recurrent::new(&config));
+        Self { model: Arc::new(Model::new(config).unwrap()), network }
     }
+
+    /// Parameters large enough that no gradient hides in rounding.
+    fn params(&self, seed: u64) -> Vec<f32> {
+        gradcheck::noise(seed, self.model.layout().len()).iter().map(|x| 0.7 * x).collect()
+    }
+
+    fn learner(&self, shards: usize, threads: usize, params: Vec<f32>) -> TdLearner<Recurrent> {
+        let config = UpdateConfig {
+            gamma: 0.9,
+            lr: 1e-2,
+            optimizer: OptimizerKind::Adam { beta1: 0.9, beta2: 0.999, eps: 1e-8 },
+            grad_norm_clip: 10.0,
+            shards,
+            threads,
+            terminal_states: TerminalStates::LeftOut,
+        };
+        TdLearner::new(Arc::clone(&self.model), Arc::clone(&self.network), config, params).unwrap()
+    }
+
+    fn acting(&self, params: &[f32]) -> ValueActing<Recurrent> {
+        ValueActing::new(Arc::clone(&self.network), &params[self.network.parts().acting.clone()])
+    }
+}
+
+/// What learner measures, by name.
+fn measure(learner: &TdLearner<Recurrent>, values: &[f64], name: &str) -> f64 {
+    let measures = rit_algo::Learner::measures(learner);
+    let at = measures.iter().position(|measure| measure.name == name);
+    at.map_or(0.0, |at| values[at])
 }
 
 /// An episode of random content: blind and partly blind agents, unavailable actions.
@@ -73,58 +127,37 @@ fn batch(seed: u64) -> Vec<Episode> {
     ]
 }
 
-fn update(rit: &Arc<Rit>, shards: usize, threads: usize, params: Vec<f32>) -> Update {
-    let optimizer = OptimizerKind::Adam { beta1: 0.9, beta2: 0.999, eps: 1e-8 };
-    let terminal_states = TerminalStates::LeftOut;
-    let config = UpdateConfig {
-        gamma: 0.9,
-        lr: 1e-2,
-        optimizer,
-        grad_norm_clip: 10.0,
-        shards,
-        threads,
-        terminal_states,
-    };
-    Update::new(Arc::clone(rit), config, params).unwrap()
-}
-
-/// Parameters large enough that no gradient hides in rounding.
-fn params(rit: &Rit, seed: u64) -> Vec<f32> {
-    gradcheck::noise(seed, rit.layout.len()).iter().map(|x| 0.7 * x).collect()
-}
-
 #[test]
 fn every_parameters_gradient_is_the_numeric_one() {
-    for (heads, representations, network) in
-        [(1, true, true), (2, true, true), (2, false, true), (2, true, false), (1, false, false)]
-    {
-        let rit = Arc::new(Rit::new(config(heads, representations, network)).unwrap());
+    for case in CASES {
+        let networks = Networks::new(case);
         let episodes = batch(7);
         let batch: Vec<&Episode> = episodes.iter().collect();
-        let at = params(&rit, 4);
-        let mut update = update(&rit, 2, 1, at.clone());
+        let at = networks.params(12);
+        let mut learner = networks.learner(2, 1, at.clone());
         // The target stays where it is while the online parameters move.
-        update.target = gradcheck::noise(5, update.target.len());
+        learner.target = gradcheck::noise(5, learner.target.len());
         let pairing = |rows| draw_pairing(rows, &mut RunSeed(1).stream(Stream::Pairing, 0));
-        update.gradients(&batch, pairing);
-        let grads = update.grads().to_vec();
+        learner.gradients(&batch, &(), pairing);
+        let grads = learner.grads().to_vec();
         let mut moved = at.clone();
-        for param in rit.layout.params() {
+        for param in networks.model.layout().params() {
             let range = param.range.clone();
             if param.name.ends_with("attention.key.bias") {
                 // Softmax does not see what is added to every score: the true gradient is zero.
                 let largest = grads[range].iter().fold(0.0_f32, |largest, g| largest.max(g.abs()));
-                assert!(largest < 1e-5, "{}: {largest}", param.name);
+                assert!(largest < 1e-5, "{case:?} {}: {largest}", param.name);
                 continue;
             }
-            let cell = std::cell::RefCell::new((&mut update, &mut moved));
-            gradcheck::check(&param.name, &at[range.clone()], &grads[range.clone()], |values| {
-                let (update, moved) = &mut *cell.borrow_mut();
+            let cell = std::cell::RefCell::new((&mut learner, &mut moved));
+            let name = format!("{case:?} {}", param.name);
+            gradcheck::check(&name, &at[range.clone()], &grads[range.clone()], |values| {
+                let (learner, moved) = &mut *cell.borrow_mut();
                 moved[range.clone()].copy_from_slice(values);
-                update.params.copy_from_slice(moved);
-                let losses = update.gradients(&batch, pairing);
+                learner.params.copy_from_slice(moved);
+                let values = learner.gradients(&batch, &(), pairing);
                 moved[range.clone()].copy_from_slice(&at[range.clone()]);
-                losses.td_loss + losses.contrastive_loss
+                measure(learner, &values, "td_loss") + measure(learner, &values, "contrastive_loss")
             });
         }
     }
@@ -132,7 +165,7 @@ fn every_parameters_gradient_is_the_numeric_one() {
 
 /// Plays an episode's observations to a policy, step by step, and forces the recorded actions by making
 /// nothing else available.
-fn replay(acting: &mut RitActing, slots: &[(usize, &Episode)]) -> Vec<Vec<f32>> {
+fn replay(acting: &mut ValueActing<Recurrent>, slots: &[(usize, &Episode)]) -> Vec<Vec<f32>> {
     let mut utilities = vec![vec![]; slots.len()];
     for &(slot, episode) in slots {
         acting.begin(slot, episode.n_agents);
@@ -185,29 +218,38 @@ fn replay(acting: &mut RitActing, slots: &[(usize, &Episode)]) -> Vec<Vec<f32>> 
     utilities
 }
 
+/// What a learner's online network says of a batch, by (episode, time): utilities `[n, A]` and Q_total.
+fn said(learner: &mut TdLearner<Recurrent>, batch: &[&Episode]) -> HashMap<(usize, usize), (Vec<f32>, f32)> {
+    let said = Mutex::new(HashMap::new());
+    let see = |seen: &SeenShard<'_>| {
+        let values: HashMap<_, _> = seen.values().collect();
+        let groups = seen.rows.steps.iter().zip(&seen.rows.groups).enumerate();
+        said.lock().unwrap().extend(groups.map(|(group, (step, rows))| {
+            let utilities = rows.queries.clone().flat_map(|row| values["utilities"].row(row).to_vec());
+            let q_total = values["q_total"].row(group)[0];
+            ((seen.first_episode + step.episode, step.time), (utilities.collect(), q_total))
+        }));
+    };
+    learner.gradients_seen(batch, &(), |rows| (0..rows).collect(), see);
+    said.into_inner().unwrap()
+}
+
 #[test]
-fn acting_row_by_row_equals_the_masked_parallel_pass() {
-    for representations in [true, false] {
-        let rit = Arc::new(Rit::new(config(2, representations, true)).unwrap());
-        let at = params(&rit, 3);
+fn acting_step_by_step_equals_the_parallel_pass() {
+    for case in CASES {
+        let networks = Networks::new(case);
+        let at = networks.params(3);
         let episodes = batch(11);
         let batch: Vec<&Episode> = episodes.iter().collect();
-        let mut update = update(&rit, 1, 1, at.clone());
-        let trained = Mutex::new(HashMap::new());
-        let see = |states: &mut dyn Iterator<Item = Seen<'_>>| {
-            let utilities = states.map(|seen| ((seen.episode, seen.time), seen.utilities.to_vec()));
-            trained.lock().unwrap().extend(utilities);
-        };
-        update.gradients_seen(&batch, |rows| (0..rows).collect(), see);
-        let trained = trained.into_inner().unwrap();
-        let mut acting = RitActing::new(Arc::clone(&rit), &at[rit.acting()]);
+        let trained = said(&mut networks.learner(1, 1, at.clone()), &batch);
         let slots: Vec<_> = batch.iter().copied().enumerate().collect();
-        for ((index, episode), acted) in slots.iter().zip(replay(&mut acting, &slots)) {
+        for ((index, episode), acted) in slots.iter().zip(replay(&mut networks.acting(&at), &slots)) {
             for time in 0..episode.steps() {
-                let trained = &trained[&(*index, time)];
+                let (trained, _) = &trained[&(*index, time)];
                 let acted = &acted[time * episode.n_agents * A..][..episode.n_agents * A];
                 for (a, b) in acted.iter().zip(trained) {
-                    assert!((a - b).abs() <= 1e-5 * b.abs().max(1.0), "episode {index} step {time}: {a} {b}");
+                    let close = (a - b).abs() <= 1e-5 * b.abs().max(1.0);
+                    assert!(close, "{case:?} episode {index} step {time}: {a} {b}");
                 }
             }
         }
@@ -216,53 +258,126 @@ fn acting_row_by_row_equals_the_masked_parallel_pass() {
 
 #[test]
 fn acting_does_not_depend_on_company() {
-    let rit = Arc::new(Rit::new(config(2, true, true)).unwrap());
-    let at = params(&rit, 3);
-    let episodes = batch(13);
-    let together: Vec<_> = episodes.iter().enumerate().collect();
-    let all = replay(&mut RitActing::new(Arc::clone(&rit), &at[rit.acting()]), &together);
-    for (index, episode) in episodes.iter().enumerate() {
-        let alone = replay(&mut RitActing::new(Arc::clone(&rit), &at[rit.acting()]), &[(3, episode)]);
-        assert_eq!(alone[0], all[index], "episode {index}, bit for bit");
+    for case in CASES {
+        let networks = Networks::new(case);
+        let at = networks.params(3);
+        let episodes = batch(13);
+        let together: Vec<_> = episodes.iter().enumerate().collect();
+        let all = replay(&mut networks.acting(&at), &together);
+        for (index, episode) in episodes.iter().enumerate() {
+            let alone = replay(&mut networks.acting(&at), &[(3, episode)]);
+            assert_eq!(alone[0], all[index], "{case:?} episode {index}, bit for bit");
+        }
+    }
+}
+
+/// The same episode with its agents in another order: new row k is old row `order[k]`.
+fn reordered(episode: &Episode, order: &[usize]) -> Episode {
+    let (n, m) = (episode.n_agents, episode.n_entities);
+    let entities: Vec<usize> = order.iter().copied().chain(n..m).collect();
+    let mut other = Episode {
+        entities: vec![],
+        observable: vec![],
+        available: vec![],
+        actions: vec![],
+        ..episode.clone()
+    };
+    for time in 0..=episode.steps() {
+        for &row in &entities {
+            other.entities.extend_from_slice(&episode.entities[(time * m + row) * D..][..D]);
+        }
+        for &agent in order {
+            let row = &episode.observable[(time * n + agent) * m..][..m];
+            other.observable.extend(entities.iter().map(|&entity| row[entity]));
+            other.available.extend_from_slice(&episode.available[(time * n + agent) * A..][..A]);
+            if time < episode.steps() {
+                other.actions.push(episode.actions[time * n + agent]);
+            }
+        }
+    }
+    other
+}
+
+/// Where decisions are made at once, agents are alike: their order moves utilities with them, and Q_total and the loss
+/// stay. Where they are made in order, the order shows.
+#[test]
+fn reordering_agents_reorders_utilities_and_no_more() {
+    for case in CASES {
+        let networks = Networks::new(case);
+        let mut learner = networks.learner(1, 1, networks.params(3));
+        let episodes = batch(19);
+        let orders: Vec<Vec<usize>> =
+            episodes.iter().map(|episode| (0..episode.n_agents).rev().collect()).collect();
+        let others: Vec<Episode> =
+            episodes.iter().zip(&orders).map(|(episode, order)| reordered(episode, order)).collect();
+        let (batch, other) = (episodes.iter().collect::<Vec<_>>(), others.iter().collect::<Vec<_>>());
+        let loss = |learner: &mut TdLearner<Recurrent>, batch: &[&Episode]| {
+            let values = learner.gradients(batch, &(), |rows| (0..rows).collect());
+            measure(learner, &values, "td_loss")
+        };
+        let losses = [loss(&mut learner, &batch), loss(&mut learner, &other)];
+        let [ours, theirs] = [said(&mut learner, &batch), said(&mut learner, &other)];
+        let mut largest = (losses[0] - losses[1]).abs() as f32;
+        for (&(episode, time), (utilities, q_total)) in
+            ours.iter().filter(|((episode, time), _)| *time < episodes[*episode].steps())
+        {
+            let (reordered, other_total) = &theirs[&(episode, time)];
+            largest = largest.max((q_total - other_total).abs());
+            for (k, &row) in orders[episode].iter().enumerate() {
+                for (a, b) in reordered[k * A..][..A].iter().zip(&utilities[row * A..]) {
+                    largest = largest.max((a - b).abs());
+                }
+            }
+        }
+        if case.0.facts().ordered {
+            assert!(largest > 1e-3, "{case:?}: the order of decisions does not show");
+        } else {
+            assert!(largest < 1e-5, "{case:?}: {largest}");
+        }
     }
 }
 
 /// A batch need not fill every shard, nor fill them evenly.
 #[test]
 fn shards_without_episodes_add_nothing() {
-    let rit = Arc::new(Rit::new(config(1, true, true)).unwrap());
-    let episodes = batch(17);
-    let batch: Vec<&Episode> = episodes.iter().collect();
-    let grads = |shards| {
-        let mut update = update(&rit, shards, 2, params(&rit, 4));
-        let losses = update.gradients(&batch, |rows| (0..rows).rev().collect());
-        (losses, update.grads().to_vec())
-    };
-    let (losses, five) = grads(5);
-    // Eight shards of one episode at most; four, of two at most.
-    for shards in [8, 4] {
-        let (other, grads) = grads(shards);
-        assert!((losses.td_loss - other.td_loss).abs() < 1e-6, "{losses:?} {other:?}");
-        for (a, b) in grads.iter().zip(&five) {
-            assert!((a - b).abs() < 1e-4 * b.abs().max(1.0), "{shards} shards: {a} {b}");
+    for case in CASES {
+        let networks = Networks::new(case);
+        let episodes = batch(17);
+        let batch: Vec<&Episode> = episodes.iter().collect();
+        let grads = |shards| {
+            let mut learner = networks.learner(shards, 2, networks.params(4));
+            let values = learner.gradients(&batch, &(), |rows| (0..rows).rev().collect());
+            (values[0], learner.grads().to_vec())
+        };
+        let (loss, five) = grads(5);
+        // Eight shards of one episode at most; four, of two at most.
+        for shards in [8, 4] {
+            let (other, grads) = grads(shards);
+            assert!((loss - other).abs() < 1e-6, "{case:?}: {loss} {other}");
+            for (a, b) in grads.iter().zip(&five) {
+                assert!((a - b).abs() < 1e-4 * b.abs().max(1.0), "{case:?}, {shards} shards: {a} {b}");
+            }
         }
     }
 }
 
 #[test]
 fn threads_change_no_bit() {
-    let rit = Arc::new(Rit::new(config(2, true, true)).unwrap());
-    let run = |threads| {
-        let mut update = update(&rit, 3, threads, params(&rit, 3));
-        for step in 0..5 {
-            let episodes = batch(step);
-            let rng = &mut RunSeed(9).stream(Stream::Pairing, step);
-            update.step(&episodes.iter().collect::<Vec<_>>(), rng);
-            update.update_target();
-        }
-        update.params
-    };
-    let alone = run(1);
-    assert_eq!(alone, run(2));
-    assert_eq!(alone, run(4));
+    for case in CASES {
+        let networks = Networks::new(case);
+        let run = |threads| {
+            let mut learner = networks.learner(3, threads, networks.params(3));
+            for step in 0..5 {
+                let episodes = batch(step);
+                let draw = rit_algo::learner::Draw { seed: RunSeed(9), update: step };
+                let batch: Vec<&Episode> = episodes.iter().collect();
+                rit_algo::Learner::learn(&mut learner, &batch, draw).unwrap();
+                learner.update_target();
+            }
+            learner.params
+        };
+        let alone = run(1);
+        assert_eq!(alone, run(2), "{case:?}");
+        assert_eq!(alone, run(4), "{case:?}");
+    }
 }

@@ -192,7 +192,7 @@ impl Values<'_> {
 }
 
 /// One operation's backward.
-type Step<'a> = Box<dyn FnOnce(&mut Backward<'_>) + Send + 'a>;
+type Step<'a> = Box<dyn FnOnce(&mut Backward<'_>) + Send + Sync + 'a>;
 
 /// A recording of one forward pass.
 pub struct Tape<'a> {
@@ -332,7 +332,7 @@ impl<'a> Tape<'a> {
     }
 
     /// Records the backward of the operation that made the values pushed last.
-    pub fn record(&mut self, step: impl FnOnce(&mut Backward<'_>) + Send + 'a) {
+    pub fn record(&mut self, step: impl FnOnce(&mut Backward<'_>) + Send + Sync + 'a) {
         if self.recording {
             self.steps.push((self.recorded, Box::new(step)));
             self.recorded = self.values.nodes.len();
@@ -369,6 +369,12 @@ impl<'a> Tape<'a> {
     /// The gradient that backward left by an [input](Tape::input): of zeros where none reached it.
     pub fn gradient(&mut self, x: Var) -> View<'_> {
         self.gradients.kept(x)
+    }
+
+    /// Takes the gradient by a whole [input](Tape::input) away, dense, in a buffer of the memory for gradients.
+    pub fn take_gradient(&mut self, x: Var) -> Buffer {
+        debug_assert!(x.first == 0);
+        self.gradients.remove(x)
     }
 
     fn node(&mut self, place: Place<'a>, rows: usize, cols: usize) -> Var {

@@ -199,6 +199,13 @@ impl Gradients {
         }
     }
 
+    /// Takes the gradient by a whole input away, zeros where none came.
+    pub(super) fn remove(&mut self, x: Var) -> Buffer {
+        let gradient = self.take(x).or_else(|| self.begin_adding(x));
+        self.slots[x.node].written.clear();
+        gradient.map_or_else(Buffer::default, |gradient| gradient.buffer)
+    }
+
     /// The gradient by an input, zeros where none came.
     pub(super) fn kept(&mut self, x: Var) -> View<'_> {
         // Taking it makes zeros of what no contribution reached.

@@ -1,0 +1,13 @@
+//! What makes learners of networks: a batch cut into shards, threads that work on them, sums over them in a fixed tree,
+//! objectives, one step of the optimiser; and acting.
+
+mod acting;
+mod pairs;
+mod shards;
+pub mod td;
+
+pub use acting::ValueActing;
+pub use shards::{Sums, tree_sum, tree_sum_f64};
+pub use td::{
+    Head, Pass, Role, SeenShard, TdLearner, TdPass, Totals, Utilities, ValueNetwork, ValueParts, measures,
+};
