@@ -53,7 +53,7 @@ impl Networks {
             n_heads,
             task_representation_dim: 3,
             reward_embed_dim: 2,
-            mixing_embed_dim: 4,
+            mixing_embed_dim: 6,
             hypernet_embed_dim: 5,
         };
         let network = Arc::new(Recurrent::new(&config));
@@ -129,17 +129,28 @@ fn batch(seed: u64) -> Vec<Episode> {
 
 #[test]
 fn every_parameters_gradient_is_the_numeric_one() {
-    for case in CASES {
+    // Half of the cases have every part.
+    for &case in CASES.iter().step_by(2) {
         let networks = Networks::new(case);
         let episodes = batch(7);
         let batch: Vec<&Episode> = episodes.iter().collect();
-        let at = networks.params(12);
-        let mut learner = networks.learner(2, 1, at.clone());
-        // The target stays where it is while the online parameters move.
-        learner.target = gradcheck::noise(5, learner.target.len());
         let pairing = |rows| draw_pairing(rows, &mut RunSeed(1).stream(Stream::Pairing, 0));
-        learner.gradients(&batch, &(), pairing);
-        let grads = learner.grads().to_vec();
+        let gradients = |seed| {
+            let mut learner = networks.learner(2, 1, networks.params(seed));
+            // The target stays where it is while the online parameters move.
+            learner.target = gradcheck::noise(5, learner.target.len());
+            learner.gradients(&batch, &(), pairing);
+            learner
+        };
+        // So small a layer's ReLUs may all be dead, which shows nothing.
+        let shows = |learner: &TdLearner<Recurrent>| {
+            let layout = networks.model.layout();
+            let live = |name: &str| !name.ends_with("attention.key.bias");
+            let mut params = layout.params().iter().filter(|param| live(&param.name));
+            params.all(|param| learner.grads()[param.range.clone()].iter().any(|&g| g != 0.0))
+        };
+        let Some(mut learner) = (0..50).map(gradients).find(shows) else { panic!("{case:?}: dead") };
+        let (at, grads) = (learner.params.clone(), learner.grads().to_vec());
         let mut moved = at.clone();
         for param in networks.model.layout().params() {
             let range = param.range.clone();
