@@ -132,7 +132,8 @@ impl<N: ValueNetwork> Policy for ValueActing<N> {
                 choose_at_once(tape.slice(of_rows), rows, parts.n_actions, turns);
                 utilities.extend_from_slice(tape.slice(of_rows));
             }
-            Head::Ordered(decoder, mut pass) => {
+            Head::Ordered(ordered) => {
+                let (decoder, mut pass) = *ordered;
                 choose_in_order(&decoder, params, rows, &mut pass, turns);
                 utilities.extend_from_slice(pass.decided());
                 pass.free(&mut tape);

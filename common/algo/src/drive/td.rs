@@ -95,7 +95,7 @@ pub enum Head<'a> {
     /// All agents decide at once: Q, (R, A).
     Independent(Var),
     /// Agents decide one after another.
-    Ordered(Decoder, DecoderPass<'a>),
+    Ordered(Box<(Decoder, DecoderPass<'a>)>),
 }
 
 impl<'a> Head<'a> {
@@ -107,7 +107,10 @@ impl<'a> Head<'a> {
                 let rows = (0..utilities.rows).map(|row| tape.view(*utilities).row(row));
                 rows.zip(available).map(|(utilities, available)| best(utilities, available)).collect()
             }
-            Self::Ordered(decoder, pass) => decoder.greedy(tape.params, rows, pass),
+            Self::Ordered(ordered) => {
+                let (decoder, pass) = &mut **ordered;
+                decoder.greedy(tape.params, rows, pass)
+            }
         }
     }
 
@@ -115,7 +118,10 @@ impl<'a> Head<'a> {
     pub fn utilities(self, tape: &mut Tape<'a>, rows: &Rows, actions: &[u8]) -> Var {
         match self {
             Self::Independent(utilities) => utilities,
-            Self::Ordered(decoder, pass) => decoder.utilities(tape, rows, pass, actions),
+            Self::Ordered(ordered) => {
+                let (decoder, pass) = *ordered;
+                decoder.utilities(tape, rows, pass, actions)
+            }
         }
     }
 }

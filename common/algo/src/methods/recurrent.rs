@@ -29,7 +29,7 @@ enum Output {
     /// h → A, each agent by itself.
     Linear(Linear),
     /// Each agent given the actions before its own.
-    Decoder(Decoder),
+    Decoder(Box<Decoder>),
 }
 
 impl Recurrent {
@@ -47,7 +47,8 @@ impl Recurrent {
         let encoder = new_encoder(layout, "utility");
         let gru = Gru::new(layout, "utility.gru", if beside { h + a } else { a }, h);
         let output = if facts.ordered {
-            Output::Decoder(Decoder::new(layout, "utility", config.n_actions, h, a, config.n_heads, z))
+            let heads = config.n_heads;
+            Output::Decoder(Box::new(Decoder::new(layout, "utility", config.n_actions, h, a, heads, z)))
         } else {
             Output::Linear(Linear::new(layout, "utility.head", h, config.n_actions))
         };
@@ -102,7 +103,7 @@ impl ValueNetwork for Recurrent {
             Output::Linear(layer) => Head::Independent(tape.linear(layer, memory)),
             Output::Decoder(decoder) => {
                 let prepared = decoder.prepare(tape, pass.tables, memory, pass.representation);
-                Head::Ordered(decoder.clone(), prepared)
+                Head::Ordered(Box::new((Decoder::clone(decoder), prepared)))
             }
         };
         Utilities { memory, head, extras: () }
