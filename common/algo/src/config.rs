@@ -17,12 +17,18 @@ pub struct ModelConfig {
     pub entity_dim: usize,
     /// A.
     pub n_actions: usize,
-    /// h.
+    /// n, over training and testing tasks: slots of inputs of fixed length.
+    pub agents_max: usize,
+    /// m, likewise.
+    pub entities_max: usize,
+    /// h; MAT's e.
     pub hidden_dim: usize,
-    /// a: all heads together.
+    /// a: all heads together. MAT's are as wide as h.
     pub attention_dim: usize,
     /// Heads of every attention.
     pub n_heads: usize,
+    /// Blocks of MAT's encoder, and of its decoder.
+    pub n_blocks: usize,
     /// h_z.
     pub task_representation_dim: usize,
     /// r.
@@ -43,10 +49,12 @@ pub enum ConfigError {
         name: &'static str,
     },
     /// Heads that do not split the attention evenly.
-    #[error("attention_dim {attention_dim} is not a multiple of n_heads {n_heads}")]
+    #[error("{name} {size} is not a multiple of n_heads {n_heads}")]
     Heads {
-        /// a.
-        attention_dim: usize,
+        /// What they split: its name.
+        name: &'static str,
+        /// It.
+        size: usize,
         /// Heads.
         n_heads: usize,
     },
@@ -77,9 +85,16 @@ impl ModelConfig {
             ("entity_dim", self.entity_dim),
             ("n_actions", self.n_actions),
             ("hidden_dim", self.hidden_dim),
-            ("attention_dim", self.attention_dim),
             ("n_heads", self.n_heads),
         ];
+        match facts.encoder {
+            Encoder::Flat => sizes.extend([
+                ("agents_max", self.agents_max),
+                ("entities_max", self.entities_max),
+                ("n_blocks", self.n_blocks),
+            ]),
+            _ => sizes.push(("attention_dim", self.attention_dim)),
+        }
         if facts.task_representations {
             sizes.extend([
                 ("task_representation_dim", self.task_representation_dim),
@@ -95,8 +110,12 @@ impl ModelConfig {
         if let Some((name, _)) = sizes.into_iter().find(|(_, size)| *size == 0) {
             return Err(ConfigError::Zero { name });
         }
-        if !self.attention_dim.is_multiple_of(self.n_heads) {
-            return Err(ConfigError::Heads { attention_dim: self.attention_dim, n_heads: self.n_heads });
+        let (name, size) = match facts.encoder {
+            Encoder::Flat => ("hidden_dim", self.hidden_dim),
+            _ => ("attention_dim", self.attention_dim),
+        };
+        if self.method != Method::Mappo && !size.is_multiple_of(self.n_heads) {
+            return Err(ConfigError::Heads { name, size, n_heads: self.n_heads });
         }
         Ok(())
     }
@@ -119,4 +138,43 @@ pub struct UpdateConfig {
     pub threads: usize,
     /// Whether states that no target needs are worked on. Not part of the result.
     pub terminal_states: TerminalStates,
+    /// Those of on-policy methods alone.
+    pub ppo: PpoConfig,
+}
+
+/// Constants of proximal policy optimisation.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PpoConfig {
+    /// λ of the advantages.
+    pub gae_lambda: f64,
+    /// c: how far a probability ratio, or a value, may go.
+    pub clip: f64,
+    /// Weight of the entropy.
+    pub entropy_coef: f64,
+    /// Weight of the value loss.
+    pub value_coef: f64,
+    /// Where the value loss becomes linear.
+    pub huber_delta: f64,
+    /// Passes over a batch; at least 1.
+    pub epochs: usize,
+    /// Parts of a batch, an optimiser step each; at least 1.
+    pub minibatches: usize,
+    /// How much of the value normaliser's old averages stays after a batch.
+    pub value_norm_beta: f64,
+}
+
+impl Default for PpoConfig {
+    /// MAPPO's, of its published scripts.
+    fn default() -> Self {
+        Self {
+            gae_lambda: 0.95,
+            clip: 0.2,
+            entropy_coef: 0.01,
+            value_coef: 1.0,
+            huber_delta: 10.0,
+            epochs: 10,
+            minibatches: 1,
+            value_norm_beta: 0.9999,
+        }
+    }
 }

@@ -3,7 +3,7 @@
 
 mod acting;
 mod pairs;
-mod shards;
+pub(crate) mod shards;
 pub mod td;
 
 pub use acting::ValueActing;

@@ -109,7 +109,7 @@ impl Method {
         let rival = Facts { encoder: E::Within, task_representations: false, ..rit };
         let independent = Facts { ordered: false, ..rival };
         let unbuilt = Facts { built: false, ..independent };
-        let on_policy = Facts { regime: Regime::OnPolicy, encoder: E::Flat, mixing: None, ..unbuilt };
+        let on_policy = Facts { regime: Regime::OnPolicy, encoder: E::Flat, mixing: None, ..independent };
         match self {
             Self::Rit => rit,
             Self::RitVdn => {

@@ -9,7 +9,9 @@ pub use recurrent::Recurrent;
 use crate::{
     Learner, Model, UpdateConfig,
     drive::{TdLearner, ValueActing},
+    methods::{mappo::MappoActing, mat::MatActing},
     model::Network,
+    on_policy::PpoLearner,
 };
 use rayon::ThreadPoolBuildError;
 use rit_episode::{Policy, Turn};
@@ -27,12 +29,11 @@ pub fn learner(
     update: UpdateConfig,
     params: Vec<f32>,
 ) -> Result<Box<dyn Learner>, ThreadPoolBuildError> {
-    match &model.network {
-        Network::Recurrent(network) => {
-            let network = Arc::clone(network);
-            Ok(Box::new(TdLearner::new(model, network, update, params)?))
-        }
-    }
+    Ok(match model.network.clone() {
+        Network::Recurrent(network) => Box::new(TdLearner::new(model, network, update, params)?),
+        Network::Mappo(network) => Box::new(PpoLearner::new(model, network, update, params)?),
+        Network::Mat(network) => Box::new(PpoLearner::new(model, network, update, params)?),
+    })
 }
 
 /// A method's networks choosing joint actions, for several running episodes at once.
@@ -53,9 +54,11 @@ impl Acting {
     /// # Panics
     /// When there are not as many as acting needs.
     pub fn new(model: &Model, params: &[f32]) -> Self {
-        match &model.network {
-            Network::Recurrent(network) => Self(Box::new(ValueActing::new(Arc::clone(network), params))),
-        }
+        Self(match model.network.clone() {
+            Network::Recurrent(network) => Box::new(ValueActing::new(network, params)),
+            Network::Mappo(network) => Box::new(MappoActing::new(network, params)),
+            Network::Mat(network) => Box::new(MatActing::new(network, params)),
+        })
     }
 
     /// Takes other weights. Between episodes only: a running one would go on with histories of the old.

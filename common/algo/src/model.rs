@@ -1,6 +1,9 @@
 //! A method's networks: which parameters they have, and which of these acting needs.
 
-use crate::{ConfigError, Method, ModelConfig, drive::ValueNetwork as _, methods::Recurrent};
+use crate::{
+    ConfigError, Mappo, MappoConfig, Mat, MatConfig, Method, ModelConfig, drive::ValueNetwork as _,
+    flat::Slots, methods::Recurrent, on_policy::ActorCritic as _,
+};
 use rit_episode::Rng;
 use rit_nn::Layout;
 use std::{ops::Range, sync::Arc};
@@ -17,6 +20,10 @@ pub struct Model {
 pub(crate) enum Network {
     /// RIT's, its ablations' and those of the rivals that differ from it in one part.
     Recurrent(Arc<Recurrent>),
+    /// MAPPO's.
+    Mappo(Arc<Mappo>),
+    /// MAT's.
+    Mat(Arc<Mat>),
 }
 
 impl Model {
@@ -26,7 +33,19 @@ impl Model {
     /// When there is no such model.
     pub fn new(config: ModelConfig) -> Result<Self, ConfigError> {
         config.validate()?;
-        let network = Network::Recurrent(Arc::new(Recurrent::new(&config)));
+        let ModelConfig { entity_dim, n_actions, agents_max, entities_max, hidden_dim, .. } = config;
+        let slots = Slots { agents_max, entities_max, entity_dim };
+        let network = match config.method {
+            Method::Mappo => {
+                Network::Mappo(Arc::new(Mappo::new(MappoConfig { slots, n_actions, hidden_dim })))
+            }
+            Method::Mat => {
+                let ModelConfig { hidden_dim: embed_dim, n_heads, n_blocks, .. } = config;
+                let sizes = MatConfig { slots, n_actions, embed_dim, n_heads, n_blocks };
+                Network::Mat(Arc::new(Mat::new(sizes)))
+            }
+            _ => Network::Recurrent(Arc::new(Recurrent::new(&config))),
+        };
         Ok(Self { config, network })
     }
 
@@ -44,6 +63,8 @@ impl Model {
     pub fn layout(&self) -> &Layout {
         match &self.network {
             Network::Recurrent(network) => &network.parts().layout,
+            Network::Mappo(network) => network.layout(),
+            Network::Mat(network) => network.layout(),
         }
     }
 
@@ -51,6 +72,8 @@ impl Model {
     pub fn acting(&self) -> Range<usize> {
         match &self.network {
             Network::Recurrent(network) => network.parts().acting.clone(),
+            Network::Mappo(network) => network.acting(),
+            Network::Mat(network) => network.acting(),
         }
     }
 

@@ -14,14 +14,18 @@ pub use loss::Sums;
 pub use targets::{Said, Targets};
 
 use crate::{
-    Rows, TerminalStates, blocks::decoder::best, estimators::value_norm::ValueNorm, learner::Measure,
+    PpoConfig, Rows, TerminalStates, UpdateConfig,
+    blocks::decoder::best,
+    drive::{shards, tree_sum, tree_sum_f64},
+    estimators::value_norm::ValueNorm,
+    learner::Measure,
 };
 use loss::Counts;
 use rand::{Rng, seq::SliceRandom as _};
-use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder, prelude::*};
+use rayon::{ThreadPool, ThreadPoolBuildError, prelude::*};
 use rit_episode::{Action, Episode, Exploration};
 use rit_nn::{
-    Layout, Optimizer, OptimizerKind,
+    Layout, Optimizer,
     attention::Group,
     categorical, optimizer,
     tape::{Stock, Tape, Var},
@@ -92,45 +96,10 @@ pub struct Outputs {
     pub values: Var,
 }
 
-/// Constants of the update.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct PpoConfig {
-    /// γ.
-    pub gamma: f64,
-    /// λ of the advantages.
-    pub gae_lambda: f64,
-    /// c: how far a probability ratio, or a value, may go.
-    pub clip: f64,
-    /// Weight of the entropy.
-    pub entropy_coef: f64,
-    /// Weight of the value loss.
-    pub value_coef: f64,
-    /// Where the value loss becomes linear.
-    pub huber_delta: f64,
-    /// Passes over a batch.
-    pub epochs: usize,
-    /// Parts of a batch, an optimiser step each.
-    pub minibatches: usize,
-    /// How much of the value normaliser's old averages stays after a batch.
-    pub value_norm_beta: f64,
-    /// Learning rate.
-    pub lr: f32,
-    /// Which optimiser.
-    pub optimizer: OptimizerKind,
-    /// Gradients are scaled down to this norm.
-    pub grad_norm_clip: f64,
-    /// Parts a minibatch is cut into; at least 1. Part of the result.
-    pub shards: usize,
-    /// Threads that work on them; at least 1. Not part of the result.
-    pub threads: usize,
-    /// Whether states that no target needs are worked on. Not part of the result.
-    pub terminal_states: TerminalStates,
-}
-
 /// Weights under training, with everything an update needs.
 pub struct Ppo<N> {
     network: Arc<N>,
-    config: PpoConfig,
+    config: UpdateConfig,
     pool: ThreadPool,
     /// All parameters.
     pub params: Vec<f32>,
@@ -170,12 +139,13 @@ impl<N: ActorCritic> Ppo<N> {
     ///
     /// # Panics
     /// When `params` is not of the layout's length.
-    pub fn new(network: Arc<N>, config: PpoConfig, params: Vec<f32>) -> Result<Self, ThreadPoolBuildError> {
+    pub fn new(
+        network: Arc<N>,
+        config: UpdateConfig,
+        params: Vec<f32>,
+    ) -> Result<Self, ThreadPoolBuildError> {
         assert_eq!(params.len(), network.layout().len(), "parameters of the layout's length");
-        let pool = ThreadPoolBuilder::new()
-            .num_threads(config.threads.max(1))
-            .thread_name(|index| format!("update-{index}"))
-            .build()?;
+        let pool = shards::pool(config.threads)?;
         Ok(Self {
             optimizer: Optimizer::new(config.optimizer, config.lr, params.len()),
             value_norm: ValueNorm::default(),
@@ -194,14 +164,14 @@ impl<N: ActorCritic> Ppo<N> {
     pub fn update<R: Rng>(&mut self, batch: &[&Episode], stream: impl Fn(u64) -> R) -> Vec<Losses> {
         let said = self.said(batch);
         let targets = self.targets(batch, said);
-        let mut all = Vec::with_capacity(self.config.epochs * self.config.minibatches);
+        let mut all = Vec::with_capacity(self.config.ppo.epochs * self.config.ppo.minibatches);
         let mut order: Vec<usize> = (0..batch.len()).collect();
-        for epoch in 0..self.config.epochs {
-            if self.config.minibatches > 1 {
+        for epoch in 0..self.config.ppo.epochs {
+            if self.config.ppo.minibatches > 1 {
                 order.sort_unstable();
                 order.shuffle(&mut stream(epoch as u64));
             }
-            for minibatch in 0..self.config.minibatches {
+            for minibatch in 0..self.config.ppo.minibatches {
                 let losses = self.gradients(batch, &targets, self.minibatch(&order, minibatch));
                 let finite = losses.is_finite();
                 all.push(losses);
@@ -216,7 +186,7 @@ impl<N: ActorCritic> Ppo<N> {
 
     /// The episodes of a minibatch: a slice of the epoch's order.
     fn minibatch<'o>(&self, order: &'o [usize], minibatch: usize) -> &'o [usize] {
-        let bound = |index: usize| index * order.len() / self.config.minibatches;
+        let bound = |index: usize| index * order.len() / self.config.ppo.minibatches;
         &order[bound(minibatch)..bound(minibatch + 1)]
     }
 
@@ -224,9 +194,10 @@ impl<N: ActorCritic> Ppo<N> {
     pub fn said(&mut self, batch: &[&Episode]) -> Vec<Said> {
         let Self { network, config, pool, params, shards, .. } = self;
         let (network, params) = (&**network, &params[..]);
-        let share = share(batch.len(), shards.len());
+        let count = shards.len();
         let parts = pool.install(|| {
-            let parts = shards.par_iter_mut().zip(batch.par_chunks(share)).map(|(shard, episodes)| {
+            let parts = shards.par_iter_mut().enumerate().map(|(index, shard)| {
+                let episodes = &batch[shards::part(batch.len(), count, index)];
                 shard.fill(network, episodes, config.terminal_states);
                 shard.said(network, params, episodes)
             });
@@ -246,26 +217,24 @@ impl<N: ActorCritic> Ppo<N> {
         let Self { network, config, pool, params, grads, shards, .. } = self;
         let (network, params) = (&**network, &params[..]);
         let counts = Counts::of(episodes.iter().map(|&episode| &targets[episode]));
-        let share = share(episodes.len(), shards.len());
+        let count = shards.len();
         pool.install(|| {
             shards.par_iter_mut().enumerate().for_each(|(index, shard)| {
-                let part = |at: usize| (at * share).min(episodes.len());
-                let part = &episodes[part(index)..part(index + 1)];
+                let part = &episodes[shards::part(episodes.len(), count, index)];
                 let of_part: Vec<&Episode> = part.iter().map(|&episode| batch[episode]).collect();
                 let targets: Vec<&Targets> = part.iter().map(|&episode| &targets[episode]).collect();
                 shard.fill(network, &of_part, config.terminal_states);
                 shard.gradients(network, params, &targets, config, counts);
             });
+            let parts: Vec<&[f32]> = shards.iter().map(|shard| &shard.grads[..]).collect();
+            tree_sum(grads, &parts);
         });
-        let mut losses = Losses::default();
-        grads.fill(0.0);
-        for shard in shards.iter() {
-            grads.iter_mut().zip(&shard.grads).for_each(|(sum, part)| *sum += part);
-            losses.sums.add(&shard.loss.sums);
-        }
+        let sums: Vec<_> = shards.iter().map(|shard| shard.loss.sums.to_vec()).collect();
+        let mut losses = Losses { sums: Sums::from_slice(&tree_sum_f64(&sums)), ..Losses::default() };
         losses.sums.divide(counts);
         let Sums { policy_loss, entropy, value_loss, .. } = losses.sums;
-        losses.loss = policy_loss - config.entropy_coef * entropy + config.value_coef * value_loss;
+        let PpoConfig { entropy_coef, value_coef, .. } = config.ppo;
+        losses.loss = policy_loss - entropy_coef * entropy + value_coef * value_loss;
         let norm = |part: Range<usize>| optimizer::sum_of_squares(&grads[part]).sqrt();
         losses.grad_norms = network.clipped_apart().into_iter().map(norm).collect();
         losses
@@ -300,11 +269,6 @@ pub fn choose(logits: &[f32], available: &[u8], exploration: &mut Exploration) -
     }
 }
 
-/// Episodes of a shard: all but the last have as many.
-fn share(episodes: usize, shards: usize) -> usize {
-    episodes.div_ceil(shards).max(1)
-}
-
 impl Shard {
     fn fill(&mut self, network: &impl ActorCritic, episodes: &[&Episode], terminal_states: TerminalStates) {
         self.inputs.rows.fill_from_episodes(episodes, terminal_states);
@@ -312,6 +276,9 @@ impl Shard {
     }
 
     fn said(&mut self, network: &impl ActorCritic, params: &[f32], episodes: &[&Episode]) -> Vec<Said> {
+        if self.inputs.rows.groups.is_empty() {
+            return Vec::new();
+        }
         let mut tape = Tape::inference(params, std::mem::take(&mut self.stock));
         let Outputs { logits, values } = network.forward(&mut tape, &self.inputs);
         let (rows, values) = (&self.inputs.rows, tape.slice(values));
@@ -327,7 +294,7 @@ impl Shard {
         network: &impl ActorCritic,
         params: &[f32],
         targets: &[&Targets],
-        config: &PpoConfig,
+        config: &UpdateConfig,
         counts: Counts,
     ) {
         self.grads.clear();
@@ -340,8 +307,8 @@ impl Shard {
         let Outputs { logits, values } = network.forward(&mut tape, &self.inputs);
         let rows = &self.inputs.rows;
         self.loss.distribution(rows, tape.view(logits));
-        self.loss.policy(rows, targets, config, counts);
-        self.loss.value(rows, network.value_rows(), tape.slice(values), targets, config, counts);
+        self.loss.policy(rows, targets, &config.ppo, counts);
+        self.loss.value(rows, network.value_rows(), tape.slice(values), targets, &config.ppo, counts);
         tape.seed(logits, self.loss.d_logits());
         tape.seed(values, self.loss.d_values());
         tape.backward(&mut self.grads);

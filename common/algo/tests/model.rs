@@ -4,7 +4,7 @@
 
 use rand::RngExt as _;
 use rit_algo::{
-    Method, Model, ModelConfig, TerminalStates, UpdateConfig,
+    Method, Model, ModelConfig, PpoConfig, TerminalStates, UpdateConfig,
     blocks::draw_pairing,
     drive::{SeenShard, TdLearner, ValueActing, ValueNetwork as _},
     method::Encoder,
@@ -50,7 +50,10 @@ impl Networks {
             n_actions: A,
             hidden_dim: 6,
             attention_dim: 4,
+            agents_max: 3,
+            entities_max: 5,
             n_heads,
+            n_blocks: 1,
             task_representation_dim: 3,
             reward_embed_dim: 2,
             mixing_embed_dim: 6,
@@ -74,6 +77,7 @@ impl Networks {
             shards,
             threads,
             terminal_states: TerminalStates::LeftOut,
+            ppo: PpoConfig::default(),
         };
         TdLearner::new(Arc::clone(&self.model), Arc::clone(&self.network), config, params).unwrap()
     }

@@ -4,9 +4,12 @@
 
 use rand::RngExt as _;
 use rit_algo::{
-    Mappo, MappoActing, MappoConfig, Mat, MatActing, MatConfig, TerminalStates,
+    Learner, Mappo, MappoActing, MappoConfig, Mat, MatActing, MatConfig, Method, Model, ModelConfig,
+    PpoConfig, TerminalStates, UpdateConfig,
     flat::Slots,
-    on_policy::{ActorCritic, Ppo, PpoConfig},
+    learner,
+    learner::{Draw, NamedState},
+    on_policy::{ActorCritic, Ppo},
 };
 use rit_episode::{
     Choice, End, Episode, EpisodeBuilder, Exploration, Observation, Policy, Rng, RunSeed, Stream, Turn,
@@ -51,23 +54,16 @@ fn mat_acting(network: &Arc<Mat>, params: &[f32]) -> Box<dyn Acting> {
     Box::new(MatActing::new(Arc::clone(network), &params[network.acting()]))
 }
 
-fn config(threads: usize) -> PpoConfig {
-    PpoConfig {
+fn config(threads: usize) -> UpdateConfig {
+    UpdateConfig {
         gamma: 0.99,
-        gae_lambda: 0.95,
-        clip: 0.2,
-        entropy_coef: 0.01,
-        value_coef: 1.0,
-        huber_delta: 10.0,
-        epochs: 2,
-        minibatches: 2,
-        value_norm_beta: 0.9999,
         lr: 5e-4,
         optimizer: OptimizerKind::Adam { beta1: 0.9, beta2: 0.999, eps: 1e-5 },
         grad_norm_clip: 10.0,
         shards: 3,
         threads,
         terminal_states: TerminalStates::LeftOut,
+        ppo: PpoConfig { epochs: 2, minibatches: 2, ..PpoConfig::default() },
     }
 }
 
@@ -200,7 +196,8 @@ fn threads_change_no_bit<N: ActorCritic>(network: &Arc<N>, acting: fn(&Arc<N>, &
 fn ratios_are_one_at_first<N: ActorCritic>(network: &Arc<N>, acting: fn(&Arc<N>, &[f32]) -> Box<dyn Acting>) {
     let params = params(&**network);
     let (episodes, _) = play(&mut *acting(network, &params), &TEAMS);
-    let config = PpoConfig { minibatches: 1, ..config(2) };
+    let ppo = PpoConfig { minibatches: 1, ..PpoConfig::default() };
+    let config = UpdateConfig { ppo, ..config(2) };
     let mut ppo = Ppo::new(Arc::clone(network), config, params).unwrap();
     let first = ppo.update(&episodes.iter().collect::<Vec<_>>(), rng)[0].sums;
     assert_eq!((first.ratio, first.clipped, first.kl), (1.0, 0.0, 0.0));
@@ -316,7 +313,7 @@ fn learns_to_tell_visible_games_apart_and_no_others<N: Matrix>(
     for (visible, wins) in [(true, 4), (false, 1)] {
         let seed = RunSeed(1);
         let params = network.layout().initial(&mut seed.stream(Stream::Weights, 0));
-        let config = PpoConfig { epochs: 10, minibatches: 1, clip: N::CLIP, ..config(2) };
+        let config = UpdateConfig { ppo: PpoConfig { clip: N::CLIP, ..PpoConfig::default() }, ..config(2) };
         let mut ppo = Ppo::new(Arc::clone(&network), config, params).unwrap();
         for update in 0..STEPS / (2 * BATCH) {
             let number = |slot: usize| (update * BATCH + slot) as u64;
@@ -359,4 +356,94 @@ impl Matrix for Mat {
     fn matrix(slots: Slots, n_actions: usize) -> Arc<Self> {
         Arc::new(Self::new(MatConfig { slots, n_actions, embed_dim: 64, n_heads: 1, n_blocks: 1 }))
     }
+}
+
+/// A learner at its beginning, with weights as above, and a batch of episodes.
+fn under_training(method: Method) -> (Box<dyn Learner>, Vec<Episode>) {
+    let model = Model::new(ModelConfig {
+        method,
+        encoder: method.facts().encoder,
+        entity_dim: SLOTS.entity_dim,
+        n_actions: A,
+        agents_max: SLOTS.agents_max,
+        entities_max: SLOTS.entities_max,
+        hidden_dim: 8,
+        attention_dim: 0,
+        n_heads: 2,
+        n_blocks: 2,
+        task_representation_dim: 0,
+        reward_embed_dim: 0,
+        mixing_embed_dim: 0,
+        hypernet_embed_dim: 0,
+    });
+    let (mappo, mat) = (mappo(SLOTS, A, 8), mat(SLOTS, A, 8));
+    let (params, mut acting) = match method {
+        Method::Mappo => (params(&*mappo), mappo_acting(&mappo, &params(&*mappo))),
+        _ => (params(&*mat), mat_acting(&mat, &params(&*mat))),
+    };
+    let learner = learner(Arc::new(model.unwrap()), config(2), params).unwrap();
+    (learner, play(&mut *acting, &TEAMS).0)
+}
+
+fn draw(update: u64) -> Draw {
+    Draw { seed: RunSeed(1), update }
+}
+
+/// Weights and the rest, in bits.
+fn everything(learner: &dyn Learner) -> (Vec<u32>, Vec<NamedState<'static>>) {
+    let params = learner.params().iter().map(|param| param.to_bits()).collect();
+    (params, learner.state().into_iter().map(NamedState::into_owned).collect())
+}
+
+#[test]
+fn a_learner_goes_on_from_its_state_as_if_it_had_never_stopped() {
+    for method in [Method::Mappo, Method::Mat] {
+        let (mut first, episodes) = under_training(method);
+        let batch: Vec<&Episode> = episodes.iter().collect();
+        let values = first.learn(&batch, draw(0)).unwrap();
+        assert_eq!(values.len(), first.measures().len());
+        let (params, state) = (first.params().to_vec(), everything(&*first).1);
+        let (mut second, _) = under_training(method);
+        second.restore(&params, &state).unwrap();
+        assert!(everything(&*first) == everything(&*second), "{method}");
+        assert_eq!(first.learn(&batch, draw(1)).unwrap(), second.learn(&batch, draw(1)).unwrap());
+        assert!(everything(&*first) == everything(&*second), "{method}");
+        // The order of minibatches is the update's own.
+        let (mut third, _) = under_training(method);
+        third.restore(&params, &state).unwrap();
+        third.learn(&batch, draw(2)).unwrap();
+        assert!(everything(&*first) != everything(&*third), "{method}");
+    }
+}
+
+#[test]
+fn what_is_not_finite_leaves_everything_as_it_was() {
+    for method in [Method::Mappo, Method::Mat] {
+        let (mut learner, mut episodes) = under_training(method);
+        let before = everything(&*learner);
+        episodes[1].rewards[0] = f32::NAN;
+        let error = learner.learn(&episodes.iter().collect::<Vec<_>>(), draw(0)).unwrap_err();
+        assert_eq!(error.to_string(), "policy_loss is not finite");
+        assert!(before == everything(&*learner), "{method}");
+        // And it goes on.
+        episodes[1].rewards[0] = 0.0;
+        learner.learn(&episodes.iter().collect::<Vec<_>>(), draw(0)).unwrap();
+    }
+}
+
+#[test]
+fn a_model_says_which_size_it_cannot_have() {
+    let (learner, _) = under_training(Method::Mat);
+    let config = |change: fn(&mut ModelConfig)| {
+        let mut config = learner.model().config().clone();
+        change(&mut config);
+        Model::new(config).map(|_| ()).map_err(|error| error.to_string())
+    };
+    assert_eq!(
+        config(|config| config.n_heads = 3).unwrap_err(),
+        "hidden_dim 8 is not a multiple of n_heads 3"
+    );
+    assert_eq!(config(|config| config.n_blocks = 0).unwrap_err(), "n_blocks is 0; it must be at least 1");
+    // MAPPO has no heads.
+    assert!(config(|config| (config.method, config.n_heads) = (Method::Mappo, 3)).is_ok());
 }

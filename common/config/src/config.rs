@@ -1,7 +1,7 @@
 //! The resolved configuration: complete, and within its limits. `presets/all.toml` says what each key means.
 
 use crate::ConfigError;
-use rit_algo::{Method, ModelConfig, Regime, TerminalStates, UpdateConfig, method::Encoder};
+use rit_algo::{Method, ModelConfig, PpoConfig, Regime, TerminalStates, UpdateConfig, method::Encoder};
 use rit_env::{EnvironmentOptions, TaskSet};
 use rit_episode::RunSeed;
 use rit_nn::OptimizerKind;
@@ -274,9 +274,12 @@ impl Config {
             encoder: Encoder::Beside,
             entity_dim: dims.entity_dim,
             n_actions: dims.n_actions,
+            agents_max: dims.agents_max,
+            entities_max: dims.entities_max,
             hidden_dim: network.hidden_dim,
             attention_dim: network.attention_dim,
             n_heads: network.n_heads,
+            n_blocks: 1,
             task_representation_dim: network.task_representation_dim,
             reward_embed_dim: network.reward_embed_dim,
             mixing_embed_dim: network.mixing_embed_dim,
@@ -302,6 +305,7 @@ impl Config {
             shards: self.learner.shards,
             threads: self.learner.threads,
             terminal_states: TerminalStates::LeftOut,
+            ppo: PpoConfig::default(),
         }
     }
 

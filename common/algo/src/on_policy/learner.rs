@@ -1,8 +1,8 @@
 //! Proximal policy optimisation as a [`Learner`]: an update is all epochs over one batch.
 
-use super::{ActorCritic, Losses, Ppo, PpoConfig};
+use super::{ActorCritic, Losses, Ppo};
 use crate::{
-    Learner, Model,
+    Learner, Model, UpdateConfig,
     estimators::value_norm::ValueNorm,
     learner::{Draw, Measure, NamedState, NotFinite, Numbers, Place, StateError, restore},
 };
@@ -42,7 +42,7 @@ pub(crate) const fn measures<const N: usize, const ALL: usize>(norms: [Measure; 
 pub struct PpoLearner<N> {
     model: Arc<Model>,
     network: Arc<N>,
-    config: PpoConfig,
+    config: UpdateConfig,
     ppo: Ppo<N>,
 }
 
@@ -57,7 +57,7 @@ impl<N: ActorCritic> PpoLearner<N> {
     pub fn new(
         model: Arc<Model>,
         network: Arc<N>,
-        config: PpoConfig,
+        config: UpdateConfig,
         params: Vec<f32>,
     ) -> Result<Self, ThreadPoolBuildError> {
         let ppo = Ppo::new(Arc::clone(&network), config, params)?;
@@ -94,7 +94,7 @@ impl<N: ActorCritic> Learner for PpoLearner<N> {
 
     fn learn(&mut self, batch: &[&Episode], draw: Draw) -> Result<Vec<f64>, NotFinite> {
         let before = (self.ppo.params.clone(), self.ppo.optimizer.clone(), self.ppo.value_norm);
-        let first = draw.update * self.config.epochs as u64;
+        let first = draw.update * self.config.ppo.epochs as u64;
         let steps = self.ppo.update(batch, |epoch| draw.seed.stream(Stream::Minibatches, first + epoch));
         let values = self.values(&steps);
         NotFinite::check(self.measures(), &values).inspect_err(|_| {

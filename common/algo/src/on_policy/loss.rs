@@ -1,8 +1,8 @@
 //! The losses of a minibatch's rows, and their gradients by logits and values.
 
-use super::{PpoConfig, Targets, ValueRows};
+use super::{Targets, ValueRows};
 use crate::{
-    Rows,
+    PpoConfig, Rows,
     estimators::{ppo, value_loss},
 };
 use rit_nn::{View, ViewMut, categorical};
@@ -43,7 +43,24 @@ pub struct Sums {
 }
 
 impl Sums {
-    pub(super) fn add(&mut self, other: &Self) {
+    pub(super) fn to_vec(self) -> Vec<f64> {
+        vec![self.policy_loss, self.entropy, self.value_loss, self.ratio, self.clipped, self.kl]
+    }
+
+    /// From what [`Sums::to_vec`] made; zeros where there is less.
+    pub(super) fn from_slice(numbers: &[f64]) -> Self {
+        let number = |at: usize| numbers.get(at).copied().unwrap_or(0.0);
+        Self {
+            policy_loss: number(0),
+            entropy: number(1),
+            value_loss: number(2),
+            ratio: number(3),
+            clipped: number(4),
+            kl: number(5),
+        }
+    }
+
+    fn add(&mut self, other: &Self) {
         self.policy_loss += other.policy_loss;
         self.entropy += other.entropy;
         self.value_loss += other.value_loss;

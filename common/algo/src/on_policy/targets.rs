@@ -1,8 +1,8 @@
 //! Once per batch, with the weights that rolled it: what the losses compare with.
 
-use super::{PpoConfig, ValueRows, loss::Buffers};
+use super::{ValueRows, loss::Buffers};
 use crate::{
-    Rows,
+    Rows, UpdateConfig,
     estimators::{gae, value_norm::ValueNorm},
 };
 use rit_episode::{End, Episode};
@@ -87,7 +87,7 @@ pub(super) fn of_batch(
     batch: &[&Episode],
     said: Vec<Said>,
     n_actions: usize,
-    config: &PpoConfig,
+    config: &UpdateConfig,
     value_norm: &mut ValueNorm,
 ) -> Vec<Targets> {
     let mut all: Vec<Targets> = batch
@@ -101,7 +101,7 @@ pub(super) fn of_batch(
     let count = returns.clone().count().max(1) as f64;
     let average = returns.clone().sum::<f64>() / count;
     let average_square = returns.map(|x| x * x).sum::<f64>() / count;
-    value_norm.update(average, average_square, config.value_norm_beta);
+    value_norm.update(average, average_square, config.ppo.value_norm_beta);
 
     let moments = gae::mean_and_deviation(all.iter().flat_map(choosing_advantages));
     for targets in &mut all {
@@ -126,7 +126,7 @@ fn of_episode(
     episode: &Episode,
     old: Said,
     n_actions: usize,
-    config: &PpoConfig,
+    config: &UpdateConfig,
     value_norm: &ValueNorm,
 ) -> Targets {
     let (n, steps) = (episode.n_agents, episode.steps());
@@ -137,7 +137,7 @@ fn of_episode(
         let value = |time: usize| value_norm.denormalized(old.values[time * per_state + of_agent]);
         let values: Vec<f64> = (0..steps).map(value).collect();
         let bootstrap = if episode.end == End::Terminated { 0.0 } else { value(steps) };
-        let along = gae::advantages(&rewards, &values, bootstrap, config.gamma, config.gae_lambda);
+        let along = gae::advantages(&rewards, &values, bootstrap, config.gamma.into(), config.ppo.gae_lambda);
         for (time, (advantage, value)) in along.into_iter().zip(values).enumerate() {
             advantages[time * per_state + of_agent] = advantage;
             returns[time * per_state + of_agent] = advantage + value;

@@ -2,10 +2,10 @@
 
 use super::{Cells, OptimizerConfig, Padding, Report, Tensors};
 use rit_algo::{
-    Mappo, MappoActing, MappoConfig, Mat, MatActing, MatConfig, TerminalStates,
+    Mappo, MappoActing, MappoConfig, Mat, MatActing, MatConfig, PpoConfig, TerminalStates, UpdateConfig,
     estimators::value_norm::ValueNorm,
     flat::Slots,
-    on_policy::{ActorCritic, Losses, Ppo, PpoConfig, Said, Targets},
+    on_policy::{ActorCritic, Losses, Ppo, Said, Targets},
 };
 use rit_episode::{Choice, Episode, Exploration, Observation, Policy, RunSeed, Stream, Turn};
 use rit_nn::{Optimizer, categorical, optimizer};
@@ -15,7 +15,7 @@ use std::{collections::HashMap, fs, path::Path, sync::Arc};
 #[derive(Deserialize)]
 struct Case {
     config: serde_json::Value,
-    gamma: f64,
+    gamma: f32,
     gae_lambda: f64,
     clip: f64,
     entropy_coef: f64,
@@ -121,22 +121,24 @@ fn compare_method<N: ActorCritic>(
     let network = Arc::new(method.network);
     let n_actions = network.n_actions();
     let (kind, lr) = case.optimizer.kind();
-    let config = PpoConfig {
+    let config = UpdateConfig {
         gamma: case.gamma,
-        gae_lambda: case.gae_lambda,
-        clip: case.clip,
-        entropy_coef: case.entropy_coef,
-        value_coef: case.value_coef,
-        huber_delta: case.huber_delta,
-        epochs: 1,
-        minibatches: case.minibatches,
-        value_norm_beta: case.value_norm.beta,
         lr,
         optimizer: kind,
         grad_norm_clip: case.grad_norm_clip,
         shards,
         threads: 2,
         terminal_states,
+        ppo: PpoConfig {
+            gae_lambda: case.gae_lambda,
+            clip: case.clip,
+            entropy_coef: case.entropy_coef,
+            value_coef: case.value_coef,
+            huber_delta: case.huber_delta,
+            epochs: 1,
+            minibatches: case.minibatches,
+            value_norm_beta: case.value_norm.beta,
+        },
     };
     let padding = Padding {
         entity_dim: slots.entity_dim,

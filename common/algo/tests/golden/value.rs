@@ -2,7 +2,7 @@
 
 use super::{Cells, OptimizerConfig, Padding, Report, Tensors, compare_step, flat};
 use rit_algo::{
-    Method, Model, ModelConfig, TerminalStates, UpdateConfig,
+    Method, Model, ModelConfig, PpoConfig, TerminalStates, UpdateConfig,
     drive::{SeenShard, TdLearner, ValueNetwork},
     method::Encoder,
     methods::Recurrent,
@@ -89,7 +89,10 @@ pub fn compare(
         n_actions: sizes.n_actions,
         hidden_dim: sizes.hidden_dim,
         attention_dim: sizes.attention_dim,
+        agents_max: sizes.agents_max,
+        entities_max: sizes.entities_max,
         n_heads: sizes.n_heads,
+        n_blocks: 1,
         task_representation_dim: sizes.task_representation_dim,
         reward_embed_dim: sizes.reward_embed_dim,
         mixing_embed_dim: sizes.mixing_embed_dim,
@@ -104,6 +107,7 @@ pub fn compare(
         shards,
         threads: 2,
         terminal_states,
+        ppo: PpoConfig::default(),
     };
     let batch = Tensors::read(folder, "batch");
     let padding = Padding {

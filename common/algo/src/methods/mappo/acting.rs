@@ -1,7 +1,10 @@
 //! MAPPO choosing joint actions, for several running episodes at once.
 
 use super::Mappo;
-use crate::on_policy::{self, ActorCritic as _};
+use crate::{
+    methods::Actor,
+    on_policy::{self, ActorCritic as _},
+};
 use rit_episode::{Policy, Turn};
 use rit_nn::{
     View,
@@ -40,19 +43,17 @@ impl MappoActing {
         acting
     }
 
-    /// Takes other weights. Between episodes only: a running one would go on with histories of the old.
-    ///
-    /// # Panics
-    /// When there are not as many as acting needs.
-    pub fn set_params(&mut self, params: &[f32]) {
-        assert_eq!(params.len(), self.mappo.acting().len(), "the parameters that acting needs");
-        self.params.clear();
-        self.params.extend_from_slice(params);
-    }
-
     /// The logits of the last [`Policy::act`], turn after turn, `[agent rows, A]`.
     pub fn logits(&self) -> &[f32] {
         &self.logits
+    }
+}
+
+impl Actor for MappoActing {
+    fn set_params(&mut self, params: &[f32]) {
+        assert_eq!(params.len(), self.mappo.acting().len(), "the parameters that acting needs");
+        self.params.clear();
+        self.params.extend_from_slice(params);
     }
 }
 

@@ -6,6 +6,7 @@
 use super::{DecoderBlock, Mat, MultiHead, normalized_sum};
 use crate::{
     Rows,
+    methods::Actor,
     on_policy::{self, ActorCritic as _, Inputs},
 };
 use rit_episode::{Policy, Turn};
@@ -55,20 +56,18 @@ impl MatActing {
         acting
     }
 
-    /// Takes other weights.
-    ///
-    /// # Panics
-    /// When there are not as many as acting needs.
-    pub fn set_params(&mut self, params: &[f32]) {
-        assert_eq!(params.len(), self.mat.acting().len(), "the parameters that acting needs");
-        self.params.clear();
-        self.params.extend_from_slice(params);
-    }
-
     /// The logits of the last [`Policy::act`], turn after turn, `[agent rows, A]`: each row's given the actions that
     /// were chosen before it.
     pub fn logits(&self) -> &[f32] {
         &self.logits
+    }
+}
+
+impl Actor for MatActing {
+    fn set_params(&mut self, params: &[f32]) {
+        assert_eq!(params.len(), self.mat.acting().len(), "the parameters that acting needs");
+        self.params.clear();
+        self.params.extend_from_slice(params);
     }
 }
 
