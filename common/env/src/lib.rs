@@ -6,6 +6,7 @@
 //! - [`Seated`]: an environment seen in decision order.
 //! - [`rollout`]: rolls numbered episodes with a [`rit_episode::Policy`], several at once.
 
+pub mod combat;
 pub mod conformance;
 mod environment;
 pub mod matrix_game;
