@@ -2,12 +2,180 @@
 //! and rewards that it shares with the real game.
 //!
 //! After the paper's section VI-C and the environments of SMAC (Samvelyan et al. 2019) and REFIL (Iqbal et al. 2021).
-//! What a simulator's win rates are is not comparable with the game's: engine, opponent, placement and collision
-//! differ.
+//! Win rates of the simulator are not comparable with the game's: engine, opponent, placement and collision differ.
 
+mod scripts;
+pub mod spawn;
 pub mod team;
+pub mod translation;
 pub mod unit;
 pub mod world;
 
+pub use scripts::CombatScript;
 pub use team::{CombatSet, Team, TeamError};
 pub use unit::{StatsVersion, UnitType};
+
+use crate::{Environment, Step};
+use rand::{RngExt as _, SeedableRng as _};
+use rit_episode::{Action, Observation, Rng};
+use serde::{Deserialize, Serialize};
+use team::TEAM_MAX;
+use translation::{RawUnit, Translation, UnitOrder};
+use world::{Order, ScriptedMedivac, Side, World};
+
+/// Ticks of one step.
+pub const TICKS_PER_STEP: usize = 8;
+
+/// How the battles of a run differ from what their set says. The default changes nothing.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct CombatOptions {
+    /// Whether armies face each other at a random angle; as the set has it where `None`.
+    pub spawn_rotate: Option<bool>,
+    /// Which numbers units have.
+    pub stats: StatsVersion,
+    /// What the opponent's medivacs do.
+    pub enemy_medivac: ScriptedMedivac,
+    /// Allies follow the opponent's script, and actions do nothing: a mirror to measure the simulator by.
+    pub mirror: bool,
+}
+
+impl CombatSet {
+    /// Whether armies face each other at a random angle in the authors' code.
+    fn rotates(self) -> bool {
+        self != Self::StalkersZealots
+    }
+}
+
+/// One battle of two teams, in the embedded simulator.
+pub struct Combat {
+    set: CombatSet,
+    teams: [Team; 2],
+    options: CombatOptions,
+    world: World,
+    translation: Translation,
+    units: Vec<RawUnit>,
+}
+
+impl Combat {
+    /// Battles of these teams, allies and enemies, as the set shows them.
+    pub fn new(set: CombatSet, teams: [Team; 2], options: CombatOptions) -> Self {
+        Self {
+            set,
+            teams,
+            options,
+            world: World::default(),
+            translation: Translation::new(set),
+            units: Vec::new(),
+        }
+    }
+
+    /// The world of the episode under way.
+    pub fn world(&self) -> &World {
+        &self.world
+    }
+
+    /// Shows the living units as the game would.
+    fn look(&mut self) {
+        self.units.clear();
+        for unit in 0..self.world.len() {
+            if !self.world.is_alive(unit) {
+                continue;
+            }
+            let stats = self.world.stats(unit);
+            let [x, y] = self.world.position(unit);
+            self.units.push(RawUnit {
+                side: self.world.side(unit),
+                kind: self.world.kind(unit),
+                tag: unit as u64,
+                x: x as f32,
+                y: y as f32,
+                health: self.world.health(unit) as f32,
+                health_max: stats.health as f32,
+                shield: self.world.shield(unit) as f32,
+                shield_max: stats.shield as f32,
+                energy: self.world.energy(unit) as f32,
+                energy_max: stats.energy as f32,
+                weapon_cooldown: self.world.cooldown(unit) as f32,
+            });
+        }
+    }
+
+    fn give_orders(&mut self, actions: &[Action]) {
+        for (agent, &action) in actions.iter().enumerate() {
+            if let Some((unit, order)) = self.translation.order(agent, action) {
+                let order = match order {
+                    UnitOrder::Stop => Order::Stop,
+                    UnitOrder::Move(point) => Order::Move(point),
+                    UnitOrder::Attack(target) => Order::Attack(target as usize),
+                    UnitOrder::Heal(target) => Order::Heal(target as usize),
+                };
+                self.world.order(unit as usize, order);
+            }
+        }
+    }
+}
+
+/// Draws distinct tags from 0 to 7 for so many units.
+fn draw_tags(count: usize, first: usize, rng: &mut Rng) -> [usize; TEAM_MAX] {
+    let mut tags: [usize; TEAM_MAX] = std::array::from_fn(|tag| first + tag);
+    for at in 0..count {
+        tags.swap(at, rng.random_range(at..TEAM_MAX));
+    }
+    tags
+}
+
+impl Environment for Combat {
+    fn n_agents(&self) -> usize {
+        self.teams[0].len()
+    }
+
+    fn n_entities(&self) -> usize {
+        self.teams[0].len() + self.teams[1].len()
+    }
+
+    fn feature_dim(&self) -> usize {
+        self.set.feature_dim()
+    }
+
+    fn n_actions(&self) -> usize {
+        self.set.n_actions()
+    }
+
+    fn steps_max(&self) -> usize {
+        self.set.steps_max()
+    }
+
+    fn reset(&mut self, rng: &mut Rng) {
+        let rotate = self.options.spawn_rotate.unwrap_or(self.set.rotates());
+        self.world.clear(self.options.stats, None);
+        self.world.set_scripted_medivacs(self.options.enemy_medivac);
+        spawn::spawn(&mut self.world, self.set, self.teams, rotate, rng);
+        if self.options.mirror {
+            spawn::send(&mut self.world, Side::Ally);
+        }
+        let [allies, enemies] = self.teams.map(Team::len);
+        let enemy_tags = draw_tags(enemies, 0, rng);
+        let ally_tags = draw_tags(allies, TEAM_MAX, rng);
+        // Attack delays have a stream of their own.
+        self.world.set_delays(Some(Rng::from_seed(rng.random())));
+        self.look();
+        let begun = self.translation.begin(&self.units, [&ally_tags, &enemy_tags]);
+        debug_assert_eq!(begun, Ok(()), "teams have 1 to 8 units");
+    }
+
+    fn observe(&self, observation: &mut Observation) {
+        self.translation.observe(observation);
+    }
+
+    fn step(&mut self, actions: &[Action], _: &mut Rng) -> Step {
+        if !self.options.mirror {
+            self.give_orders(actions);
+        }
+        for _ in 0..TICKS_PER_STEP {
+            self.world.tick();
+        }
+        self.look();
+        self.translation.advance(&self.units)
+    }
+}

@@ -101,12 +101,11 @@ pub struct World {
     busy_until: Vec<i64>,
     /// Which side a unit passes standing bodies on, while it goes round them.
     detours: Vec<Option<f64>>,
-    /// Whether a unit got hardly anywhere in the last tick.
-    held_up: Vec<bool>,
     effects: Vec<Effect>,
     orders_refused: u64,
-    /// Health and shield lost to hits so far, by side: the sums that reward and damage must agree with.
+    /// Health and shield lost to hits so far, and gained by healing and recovery, by side.
     lost: [f64; 2],
+    recovered: [f64; 2],
     // Work space of a tick, kept from one to the next.
     releases: Vec<Release>,
     healed: Vec<bool>,
@@ -120,7 +119,8 @@ impl World {
     pub fn clear(&mut self, stats_version: StatsVersion, delays: Option<Rng>) {
         self.stats_version = stats_version;
         self.delays = delays;
-        (self.now, self.orders_refused, self.lost) = (0, 0, [0.0; 2]);
+        (self.now, self.orders_refused) = (0, 0);
+        (self.lost, self.recovered) = ([0.0; 2], [0.0; 2]);
         self.kinds.clear();
         self.sides.clear();
         self.stats.clear();
@@ -139,8 +139,12 @@ impl World {
         self.wind_ups.clear();
         self.busy_until.clear();
         self.detours.clear();
-        self.held_up.clear();
         self.effects.clear();
+    }
+
+    /// Draws attack delays from this stream from now on; without one there are none.
+    pub fn set_delays(&mut self, delays: Option<Rng>) {
+        self.delays = delays;
     }
 
     /// What medivacs under [`Order::AttackMove`] do.
@@ -169,7 +173,6 @@ impl World {
         self.wind_ups.push(None);
         self.busy_until.push(0);
         self.detours.push(None);
-        self.held_up.push(false);
         self.kinds.len() - 1
     }
 
@@ -178,6 +181,11 @@ impl World {
         self.health[unit] = health.unwrap_or(self.health[unit]);
         self.shield[unit] = shield.unwrap_or(self.shield[unit]);
         self.energy[unit] = energy.unwrap_or(self.energy[unit]);
+    }
+
+    /// Which numbers its units have.
+    pub fn stats_version(&self) -> StatsVersion {
+        self.stats_version
     }
 
     /// Number of units, the dead included.
@@ -253,6 +261,11 @@ impl World {
     /// Health and shield that hits have taken from a side so far.
     pub fn lost(&self, side: Side) -> f64 {
         self.lost[side as usize]
+    }
+
+    /// Health and shield that a side has regained so far.
+    pub fn recovered(&self, side: Side) -> f64 {
+        self.recovered[side as usize]
     }
 
     /// Gives an order, to be followed from the next tick on. A busy unit finishes first; one that winds up breaks
@@ -369,8 +382,9 @@ impl World {
             }
             let stats = &self.stats[unit];
             if stats.shield > 0.0 && self.now - self.last_hit[unit] >= SHIELD_DELAY_TICKS {
-                let recovered = self.shield[unit] + SHIELD_RATE / TICKS_PER_SECOND;
-                self.shield[unit] = recovered.min(stats.shield.max(self.shield[unit]));
+                let before = self.shield[unit];
+                self.shield[unit] = (before + SHIELD_RATE / TICKS_PER_SECOND).min(stats.shield.max(before));
+                self.recovered[self.sides[unit] as usize] += self.shield[unit] - before;
             }
             if stats.energy > 0.0 {
                 self.energy[unit] = (self.energy[unit] + ENERGY_RATE / TICKS_PER_SECOND).min(stats.energy);
@@ -396,6 +410,7 @@ impl World {
             // Rounding must neither leave a patient hurt for ever nor energy below zero.
             self.health[patient] =
                 if healing == missing { self.stats[patient].health } else { self.health[patient] + healing };
+            self.recovered[self.sides[unit] as usize] += healing;
             self.energy[unit] = (self.energy[unit] - healing * ENERGY_PER_HEALTH).max(0.0);
             self.healed[patient] = true;
         }

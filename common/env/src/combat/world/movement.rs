@@ -4,7 +4,7 @@ use super::{EPSILON, Layer, MAP_SIZE, Order, Point, World, distance};
 use crate::combat::unit::TICKS_PER_SECOND;
 use std::sync::LazyLock;
 
-/// How far ahead of two touching bodies a unit looks for what bars its way.
+/// A unit looks this much farther along its way than the two bodies are thick.
 const LOOK_AHEAD: f64 = 0.25;
 /// How often a unit turns in one tick before it waits.
 const TURNS_MAX: usize = 8;
@@ -14,8 +14,6 @@ const PUSHES: usize = 4;
 const DIRECTIONS: usize = 16;
 /// A way along a body's tangent is free.
 const TANGENT: f64 = 1e-9;
-/// A unit that gets less far than this share of its step is held up: others go round it as round one that stands.
-const HELD_UP_SHARE: f64 = 0.8;
 
 /// Sixteen directions, evenly round. By libm: the same on every machine.
 static COMPASS: LazyLock<[Point; DIRECTIONS]> = LazyLock::new(|| {
@@ -68,11 +66,6 @@ impl World {
         }
         self.push_bodies();
         self.keep_inside();
-        for unit in 0..count {
-            // The goals now hold where everybody was.
-            let gone = distance(self.goals[unit], self.positions[unit]);
-            self.held_up[unit] = self.moving[unit] && gone < HELD_UP_SHARE * steps[unit];
-        }
         self.steps = steps;
     }
 
@@ -151,8 +144,7 @@ impl World {
         let (from, target) = (self.positions[unit], self.target(unit));
         let mut nearest: Option<(f64, usize)> = None;
         for other in 0..self.len() {
-            let stands = !self.moving[other] || self.held_up[other];
-            if !stands
+            if self.moving[other]
                 || !self.alive[other]
                 || other == unit
                 || Some(other) == target
@@ -162,15 +154,15 @@ impl World {
             }
             let to = [self.positions[other][0] - from[0], self.positions[other][1] - from[1]];
             let touch = self.stats[unit].separation + self.stats[other].separation;
-            let squared = to[0] * to[0] + to[1] * to[1];
-            let sees = touch + LOOK_AHEAD;
-            if squared > sees * sees {
-                continue;
-            }
             let ahead = to[0] * direction[0] + to[1] * direction[1];
             let aside = to[0] * direction[1] - to[1] * direction[0];
-            let bars = ahead > 0.0 && aside.abs() < touch - TANGENT;
-            if bars && nearest.is_none_or(|(least, _)| squared < least) {
+            if ahead <= 0.0 || aside.abs() >= touch - TANGENT {
+                continue;
+            }
+            // How far the unit gets before the bodies touch.
+            let free = ahead - (touch * touch - aside * aside).sqrt();
+            let squared = to[0] * to[0] + to[1] * to[1];
+            if free <= touch + LOOK_AHEAD && nearest.is_none_or(|(least, _)| squared < least) {
                 nearest = Some((squared, other));
             }
         }
