@@ -15,7 +15,7 @@ pub use scripts::CombatScript;
 pub use team::{CombatSet, Team, TeamError};
 pub use unit::{StatsVersion, UnitType};
 
-use crate::{Environment, Step};
+use crate::{Environment, EnvironmentError, FailureKind, Spec, Step};
 use rand::{RngExt as _, SeedableRng as _};
 use rit_episode::{Action, Observation, Rng};
 use serde::{Deserialize, Serialize};
@@ -58,6 +58,20 @@ pub struct Combat {
 }
 
 impl Combat {
+    /// What a battle of these teams is.
+    pub fn spec(set: CombatSet, [allies, enemies]: [Team; 2]) -> Spec {
+        Spec {
+            n_agents: allies.len(),
+            n_entities: allies.len() + enemies.len(),
+            feature_dim: set.feature_dim(),
+            n_actions: set.n_actions(),
+            steps_max: set.steps_max(),
+            has_wins: true,
+            has_scenes: false,
+            is_reproducible: true,
+        }
+    }
+
     /// Battles of these teams, allies and enemies, as the set shows them.
     pub fn new(set: CombatSet, teams: [Team; 2], options: CombatOptions) -> Self {
         Self {
@@ -126,27 +140,11 @@ fn draw_tags(count: usize, first: usize, rng: &mut Rng) -> [usize; TEAM_MAX] {
 }
 
 impl Environment for Combat {
-    fn n_agents(&self) -> usize {
-        self.teams[0].len()
+    fn spec(&self) -> Spec {
+        Self::spec(self.set, self.teams)
     }
 
-    fn n_entities(&self) -> usize {
-        self.teams[0].len() + self.teams[1].len()
-    }
-
-    fn feature_dim(&self) -> usize {
-        self.set.feature_dim()
-    }
-
-    fn n_actions(&self) -> usize {
-        self.set.n_actions()
-    }
-
-    fn steps_max(&self) -> usize {
-        self.set.steps_max()
-    }
-
-    fn reset(&mut self, rng: &mut Rng) {
+    fn reset(&mut self, rng: &mut Rng) -> Result<(), EnvironmentError> {
         let rotate = self.options.spawn_rotate.unwrap_or(self.set.rotates());
         self.world.clear(self.options.stats, None);
         self.world.set_scripted_medivacs(self.options.enemy_medivac);
@@ -161,14 +159,14 @@ impl Environment for Combat {
         self.world.set_delays(Some(Rng::from_seed(rng.random())));
         self.look();
         let begun = self.translation.begin(&self.units, [&ally_tags, &enemy_tags]);
-        debug_assert_eq!(begun, Ok(()), "teams have 1 to 8 units");
+        begun.map_err(|error| EnvironmentError { kind: FailureKind::BadAnswer, detail: error.to_string() })
     }
 
     fn observe(&self, observation: &mut Observation) {
         self.translation.observe(observation);
     }
 
-    fn step(&mut self, actions: &[Action], _: &mut Rng) -> Step {
+    fn step(&mut self, actions: &[Action], _: &mut Rng) -> Result<Step, EnvironmentError> {
         if !self.options.mirror {
             self.give_orders(actions);
         }
@@ -176,6 +174,6 @@ impl Environment for Combat {
             self.world.tick();
         }
         self.look();
-        self.translation.advance(&self.units)
+        Ok(self.translation.advance(&self.units))
     }
 }

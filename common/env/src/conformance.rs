@@ -1,6 +1,6 @@
 //! The suite every environment passes. Test code of any crate may run it against an environment of its own.
 
-use crate::{Environment, Step};
+use crate::{Environment, Spec, Step};
 use rand::RngExt as _;
 use rit_episode::{Action, Observation, Rng, RunSeed, Stream};
 
@@ -27,36 +27,36 @@ pub fn check(make: impl Fn() -> Box<dyn Environment>) {
 }
 
 /// One episode's course: every observation and every step.
+#[allow(clippy::expect_used, reason = "a suite of assertions")]
 fn roll(environment: &mut dyn Environment, episode: u64) -> Vec<(Observation, Option<Step>)> {
     let seed = RunSeed(99);
     let rng = &mut seed.stream(Stream::Environment, episode);
     let exploration = &mut seed.stream(Stream::Exploration, episode);
-    let sizes = |environment: &dyn Environment| {
-        (environment.n_agents(), environment.n_entities(), environment.feature_dim(), environment.n_actions())
-    };
-    let constant = sizes(environment);
-    let (n, m, features, n_actions) = constant;
+    let spec = environment.spec();
+    let Spec { n_agents: n, n_entities: m, feature_dim: features, n_actions, .. } = spec;
     assert!(n >= 1 && m >= n && features >= 1 && n_actions >= 1, "there is something to decide");
 
-    environment.reset(rng);
+    environment.begin_reset(rng).expect("an episode begins");
+    environment.reset(rng).expect("an episode begins");
     let mut course: Vec<(Observation, Option<Step>)> = Vec::new();
     loop {
         let mut observation = Observation::new(n, m, features, n_actions);
         environment.observe(&mut observation);
         check_observation(&observation);
-        assert_eq!(sizes(environment), constant, "sizes are constant");
+        assert_eq!(environment.spec(), spec, "what a task is does not change");
         assert!(
-            environment.scene().is_none_or(|scene| scene.bodies.len() == m),
-            "a scene shows every entity"
+            environment.scene().map(|scene| scene.bodies.len()) == spec.has_scenes.then_some(m),
+            "a scene shows every entity, where there are scenes"
         );
         if course.last().and_then(|(_, step)| *step).is_some_and(|step| step.end.is_some()) {
             course.push((observation, None));
             return course;
         }
-        assert!(course.len() < environment.steps_max(), "an episode ends within its limit");
+        assert!(course.len() < spec.steps_max, "an episode ends within its limit");
         let actions: Vec<Action> =
             (0..n).map(|agent| any_available(&observation, agent, exploration)).collect();
-        let step = environment.step(&actions, rng);
+        environment.begin_step(&actions).expect("a legal joint action is taken");
+        let step = environment.step(&actions, rng).expect("a legal joint action is taken");
         assert!(step.reward.is_finite() && step.shaping.is_finite(), "rewards are finite");
         course.push((observation, Some(step)));
     }

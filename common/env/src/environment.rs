@@ -1,5 +1,6 @@
 //! What one task's world does.
 
+use crate::combat::CombatOptions;
 use rit_episode::{Action, End, Observation, Rng};
 use serde::{Deserialize, Serialize};
 
@@ -16,6 +17,34 @@ pub struct Step {
     pub won: bool,
 }
 
+/// What a task is, as data: known without building its world.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Spec {
+    /// Number of agents, constant.
+    pub n_agents: usize,
+    /// Number of entities, agents included, constant.
+    pub n_entities: usize,
+    /// Features of one entity, without the last action, which [`crate::Seated`] adds.
+    pub feature_dim: usize,
+    /// Size of the action space.
+    pub n_actions: usize,
+    /// Most steps of an episode.
+    pub steps_max: usize,
+    /// Whether the task knows winning.
+    pub has_wins: bool,
+    /// Whether its states can be drawn: see [`Environment::scene`].
+    pub has_scenes: bool,
+    /// Whether the same random stream and actions give the same episode.
+    pub is_reproducible: bool,
+}
+
+impl Spec {
+    /// Features of one entity with its last action: d.
+    pub fn entity_dim(&self) -> usize {
+        self.feature_dim + self.n_actions
+    }
+}
+
 /// How the environments of a run differ from what their task says. The default changes nothing.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -25,6 +54,47 @@ pub struct EnvironmentOptions {
     /// Predator and prey: [`Step::shaping`] is this · what a step takes off Σ_predators distance to the nearest
     /// prey.
     pub approach_shaping: f32,
+    /// Of combat.
+    pub combat: CombatOptions,
+}
+
+/// What went wrong with an environment. Its name is what failures are counted under.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum FailureKind {
+    /// It reported an error of its own.
+    Raised,
+    /// It did not answer in time.
+    TimedOut,
+    /// Its process or connection is gone.
+    Died,
+    /// It answered something that no environment of its task may: a wrong shape, a number that is none, nobody who
+    /// may do anything.
+    BadAnswer,
+}
+
+impl FailureKind {
+    /// Every kind.
+    pub const ALL: [Self; 4] = [Self::Raised, Self::TimedOut, Self::Died, Self::BadAnswer];
+
+    /// A short name for counting.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Raised => "environment_raised",
+            Self::TimedOut => "environment_timed_out",
+            Self::Died => "environment_died",
+            Self::BadAnswer => "environment_bad_answer",
+        }
+    }
+}
+
+/// Why an environment cannot go on with its episode. The episode is lost, and the environment is built anew.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{detail}")]
+pub struct EnvironmentError {
+    /// What it is counted under.
+    pub kind: FailureKind,
+    /// What happened, in words for a person.
+    pub detail: String,
 }
 
 /// What a body is to the agents.
@@ -63,30 +133,43 @@ pub struct Scene {
 /// An environment draws randomness from the stream it is given and from nowhere else, and
 /// [`crate::conformance::check`] holds for it.
 pub trait Environment: Send {
-    /// Number of agents, constant.
-    fn n_agents(&self) -> usize;
+    /// What the task is. Constant.
+    fn spec(&self) -> Spec;
 
-    /// Number of entities, agents included, constant.
-    fn n_entities(&self) -> usize;
+    /// Tells the environment that an episode will begin, so that it can get to work; [`Self::reset`] follows. One that
+    /// works in this process has nothing to do here. All environments of an actor are told before the first is
+    /// waited for.
+    ///
+    /// # Errors
+    /// When it cannot be told.
+    fn begin_reset(&mut self, _rng: &mut Rng) -> Result<(), EnvironmentError> {
+        Ok(())
+    }
 
-    /// Features of one entity, without the last action, which [`crate::Seated`] adds.
-    fn feature_dim(&self) -> usize;
-
-    /// Size of the action space.
-    fn n_actions(&self) -> usize;
-
-    /// Most steps of an episode.
-    fn steps_max(&self) -> usize;
-
-    /// Begins an episode.
-    fn reset(&mut self, rng: &mut Rng);
+    /// Begins an episode, and waits until it has begun.
+    ///
+    /// # Errors
+    /// When it did not.
+    fn reset(&mut self, rng: &mut Rng) -> Result<(), EnvironmentError>;
 
     /// Writes the state: features into the first `feature_dim` columns of each entity's row (agents first),
     /// and all of `observable` and `available`, which arrive as zeros.
     fn observe(&self, observation: &mut Observation);
 
-    /// Takes one joint action, `[n_agents]`, each available.
-    fn step(&mut self, actions: &[Action], rng: &mut Rng) -> Step;
+    /// Tells the environment the joint action, so that it can get to work; [`Self::step`] follows with the same one.
+    /// As [`Self::begin_reset`].
+    ///
+    /// # Errors
+    /// When it cannot be told.
+    fn begin_step(&mut self, _actions: &[Action]) -> Result<(), EnvironmentError> {
+        Ok(())
+    }
+
+    /// Takes one joint action, `[n_agents]`, each available, and waits for what it leads to.
+    ///
+    /// # Errors
+    /// When the environment cannot go on.
+    fn step(&mut self, actions: &[Action], rng: &mut Rng) -> Result<Step, EnvironmentError>;
 
     /// What can be drawn of the state, where the entities have places.
     fn scene(&self) -> Option<Scene> {

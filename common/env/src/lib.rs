@@ -12,11 +12,15 @@ mod environment;
 pub mod matrix_game;
 pub mod particle;
 pub mod rollout;
+mod scripts;
 mod seated;
 mod task_set;
 mod unknown_name;
 
-pub use environment::{BodyKind, Environment, EnvironmentOptions, Scene, SceneBody, Step};
+pub use environment::{
+    BodyKind, Environment, EnvironmentError, EnvironmentOptions, FailureKind, Scene, SceneBody, Spec, Step,
+};
+pub use scripts::{Script, UnfitScript};
 pub use seated::Seated;
-pub use task_set::{Split, Task, TaskSet};
+pub use task_set::{Split, Task, TaskError, TaskSet};
 pub use unknown_name::UnknownName;

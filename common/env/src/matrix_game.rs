@@ -1,7 +1,7 @@
 //! The multi matrix game (paper, table I): four two-step games that look alike. The first step's reward tells
 //! which game it is; the second pays +100 for the game's one optimal joint action and −12 otherwise.
 
-use crate::{Environment, Step};
+use crate::{Environment, EnvironmentError, Spec, Step};
 use rit_episode::{Action, End, Observation, Rng};
 
 /// Reward of the first step, by game, whatever is played.
@@ -24,6 +24,18 @@ impl MatrixGame {
     /// Number of games.
     pub const GAMES: usize = 4;
 
+    /// Features are the player's one-hot (2) and the step index (1).
+    pub const SPEC: Spec = Spec {
+        n_agents: 2,
+        n_entities: 2,
+        feature_dim: 3,
+        n_actions: 3,
+        steps_max: 2,
+        has_wins: true,
+        has_scenes: false,
+        is_reproducible: true,
+    };
+
     /// The game of this index, 0 to 3.
     ///
     /// # Panics
@@ -35,29 +47,13 @@ impl MatrixGame {
 }
 
 impl Environment for MatrixGame {
-    fn n_agents(&self) -> usize {
-        2
+    fn spec(&self) -> Spec {
+        Self::SPEC
     }
 
-    fn n_entities(&self) -> usize {
-        2
-    }
-
-    /// The player's one-hot (2) and the step index (1).
-    fn feature_dim(&self) -> usize {
-        3
-    }
-
-    fn n_actions(&self) -> usize {
-        3
-    }
-
-    fn steps_max(&self) -> usize {
-        2
-    }
-
-    fn reset(&mut self, _: &mut Rng) {
+    fn reset(&mut self, _: &mut Rng) -> Result<(), EnvironmentError> {
         self.step = 0;
+        Ok(())
     }
 
     fn observe(&self, observation: &mut Observation) {
@@ -69,13 +65,13 @@ impl Environment for MatrixGame {
         observation.see_and_allow_all();
     }
 
-    fn step(&mut self, actions: &[Action], _: &mut Rng) -> Step {
+    fn step(&mut self, actions: &[Action], _: &mut Rng) -> Result<Step, EnvironmentError> {
         self.step += 1;
         if self.step == 1 {
-            return Step { reward: FIRST_REWARD[self.game], shaping: 0.0, end: None, won: false };
+            return Ok(Step { reward: FIRST_REWARD[self.game], shaping: 0.0, end: None, won: false });
         }
         let won = actions == OPTIMAL[self.game];
-        Step { reward: if won { WIN } else { MISS }, shaping: 0.0, end: Some(End::Terminated), won }
+        Ok(Step { reward: if won { WIN } else { MISS }, shaping: 0.0, end: Some(End::Terminated), won })
     }
 }
 
@@ -105,12 +101,12 @@ mod tests {
             let mut environment = MatrixGame::new(game);
             for first in 0..9_u8 {
                 for second in 0..9_u8 {
-                    environment.reset(rng);
+                    environment.reset(rng).unwrap();
                     let [one, two] = [[first / 3, first % 3], [second / 3, second % 3]];
-                    let step = environment.step(&one, rng);
+                    let step = environment.step(&one, rng).unwrap();
                     let expected = table[usize::from(one[0])][usize::from(one[1])].0;
                     assert_eq!(step, Step { reward: expected, shaping: 0.0, end: None, won: false });
-                    let step = environment.step(&two, rng);
+                    let step = environment.step(&two, rng).unwrap();
                     let expected = table[usize::from(two[0])][usize::from(two[1])].1;
                     let won = expected == 100.0;
                     assert_eq!(
@@ -128,9 +124,9 @@ mod tests {
         let seen = |game: usize, rng: &mut Rng| {
             let mut environment = MatrixGame::new(game);
             let mut observations = [Observation::new(2, 2, 3, 3), Observation::new(2, 2, 3, 3)];
-            environment.reset(rng);
+            environment.reset(rng).unwrap();
             environment.observe(&mut observations[0]);
-            environment.step(&[1, 2], rng);
+            environment.step(&[1, 2], rng).unwrap();
             environment.observe(&mut observations[1]);
             observations
         };

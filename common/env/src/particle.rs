@@ -9,5 +9,5 @@ mod world;
 
 pub use cooperative_navigation::CooperativeNavigation;
 pub use predator_prey::{PredatorPrey, PredatorPreyReward};
-pub use scripts::{Script, UnfitScript};
+pub(crate) use scripts::{act_by_nearest_assignment, chase};
 pub use world::DIRECTIONS;

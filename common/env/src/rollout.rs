@@ -1,6 +1,6 @@
 //! The rollout loop: numbered episodes in, finished episodes out. Actors and evaluation share it.
 
-use crate::{Environment, EnvironmentOptions, Seated, Task};
+use crate::{Environment, EnvironmentError, EnvironmentOptions, Seated, Task};
 use rand::RngExt as _;
 use rit_episode::{
     Action, Choice, End, Episode, EpisodeBuilder, Exploration, Observation, Policy, Rng, RunSeed, Stream,
@@ -34,9 +34,35 @@ pub struct Rollout {
     idle: Vec<Vec<Seated>>,
 }
 
+/// An episode that ended early because its environment could not go on.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("episode {number} of {task}: {error}")]
+pub struct LostEpisode {
+    /// Its number.
+    pub number: u64,
+    /// Its task.
+    pub task: String,
+    /// Why.
+    pub error: EnvironmentError,
+}
+
+/// What became of a job.
+pub type Rolled = Result<Episode, LostEpisode>;
+
+/// A job whose environment was told to begin.
+struct Beginning {
+    slot: usize,
+    job: Job,
+    task: usize,
+    world: Seated,
+    order: Vec<u8>,
+    environment_rng: Rng,
+}
+
 /// A running episode.
 struct Running {
     slot: usize,
+    number: u64,
     task: usize,
     world: Seated,
     environment_rng: Rng,
@@ -86,64 +112,101 @@ impl Rollout {
         Self { time_limit_bootstraps, ..self }
     }
 
-    /// Rolls all jobs side by side to their ends and returns their episodes in the jobs' order.
-    pub fn roll(&mut self, policy: &mut dyn Policy, jobs: &[Job]) -> Vec<Episode> {
+    /// Rolls all jobs side by side to their ends and returns what became of them, in the jobs' order. A world whose
+    /// episode is lost is not used again.
+    pub fn roll(&mut self, policy: &mut dyn Policy, jobs: &[Job]) -> Vec<Rolled> {
         self.roll_watched(policy, jobs, |_, _| {})
     }
 
     /// As [`Self::roll`], and shows each job's world to `watch`, under the job's index: when its episode has
     /// begun, and after each step. What was done and earned there is in the [`Episode`].
+    ///
+    /// Each time, all worlds are told before the first is waited for: slow ones work side by side.
     pub fn roll_watched(
         &mut self,
         policy: &mut dyn Policy,
         jobs: &[Job],
         mut watch: impl FnMut(usize, &dyn Environment),
-    ) -> Vec<Episode> {
-        let mut episodes: Vec<Option<Episode>> = jobs.iter().map(|_| None).collect();
-        let mut running: Vec<Running> =
-            jobs.iter().enumerate().map(|(slot, job)| self.begin(policy, slot, job)).collect();
+    ) -> Vec<Rolled> {
+        let mut rolled: Vec<Option<Rolled>> = jobs.iter().map(|_| None).collect();
+        let beginning: Vec<Result<Beginning, (usize, LostEpisode)>> =
+            jobs.iter().enumerate().map(|(slot, job)| self.tell_to_begin(slot, job)).collect();
+        let mut running = Vec::with_capacity(jobs.len());
+        for beginning in beginning {
+            match beginning.and_then(|beginning| self.begin(policy, beginning)) {
+                Ok(begun) => running.push(begun),
+                Err((slot, lost)) => rolled[slot] = Some(Err(lost)),
+            }
+        }
         running.iter().for_each(|running| watch(running.slot, running.world.environment()));
         while !running.is_empty() {
             let mut turns: Vec<Turn<'_>> = running.iter_mut().map(Running::turn).collect();
             policy.act(&mut turns);
             drop(turns);
+            let told: Vec<_> =
+                running.iter_mut().map(|running| running.world.begin_step(&running.actions)).collect();
             running = running
                 .into_iter()
-                .filter_map(|mut running| {
-                    let ended = running.step();
+                .zip(told)
+                .filter_map(|(mut running, told)| {
+                    let stepped = told.and_then(|()| running.step());
+                    let ended = match stepped {
+                        Ok(ended) => ended,
+                        Err(error) => {
+                            rolled[running.slot] = Some(Err(self.lost(running.number, running.task, error)));
+                            return None;
+                        }
+                    };
                     watch(running.slot, running.world.environment());
                     let Some((end, won)) = ended else {
                         return Some(running);
                     };
                     self.idle[running.task].push(running.world);
-                    episodes[running.slot] = Some(running.builder.finish(end, won));
+                    rolled[running.slot] = Some(Ok(running.builder.finish(end, won)));
                     None
                 })
                 .collect();
         }
-        episodes.into_iter().flatten().collect()
+        rolled.into_iter().flatten().collect()
     }
 
-    fn begin(&mut self, policy: &mut dyn Policy, slot: usize, job: &Job) -> Running {
+    fn lost(&self, number: u64, task: usize, error: EnvironmentError) -> LostEpisode {
+        LostEpisode { number, task: self.tasks[task].to_string(), error }
+    }
+
+    fn tell_to_begin(&mut self, slot: usize, job: &Job) -> Result<Beginning, (usize, LostEpisode)> {
         let stream = |name| self.seed.stream(name, job.number);
         let task = job.task.unwrap_or_else(|| stream(Stream::Task).random_range(0..self.tasks.len()));
+        let mut environment_rng = stream(Stream::Environment);
+        let mut order_rng = stream(Stream::DecisionOrder);
         let mut world =
             self.idle[task].pop().unwrap_or_else(|| Seated::new(self.tasks[task].environment(self.options)));
-        let n_agents = world.environment().n_agents();
+        let n_agents = world.spec().n_agents;
         let order = if self.random_permutation {
-            decision_order::draw(n_agents, &mut stream(Stream::DecisionOrder))
+            decision_order::draw(n_agents, &mut order_rng)
         } else {
             decision_order::identity(n_agents)
         };
-        let mut environment_rng = stream(Stream::Environment);
-        world.reset(order.clone(), &mut environment_rng);
+        match world.begin_reset(order.clone(), &mut environment_rng) {
+            Ok(()) => Ok(Beginning { slot, job: *job, task, world, order, environment_rng }),
+            Err(error) => Err((slot, self.lost(job.number, task, error))),
+        }
+    }
+
+    fn begin(&self, policy: &mut dyn Policy, beginning: Beginning) -> Result<Running, (usize, LostEpisode)> {
+        let Beginning { slot, job, task, mut world, order, mut environment_rng } = beginning;
+        if let Err(error) = world.reset(&mut environment_rng) {
+            return Err((slot, self.lost(job.number, task, error)));
+        }
+        let n_agents = world.spec().n_agents;
         let mut observation = Observation::default();
         world.observe(&mut observation);
         policy.begin(slot, n_agents);
-        Running {
+        Ok(Running {
             slot,
+            number: job.number,
             task,
-            time_limit: self.time_limit_bootstraps.then(|| world.environment().steps_max()),
+            time_limit: self.time_limit_bootstraps.then(|| world.spec().steps_max),
             steps: 0,
             world,
             environment_rng,
@@ -151,13 +214,13 @@ impl Rollout {
                 job.choice,
                 self.exploration_persistence,
                 n_agents,
-                stream(Stream::Exploration),
+                self.seed.stream(Stream::Exploration, job.number),
             ),
             builder: EpisodeBuilder::new(job.number, job.weights_version, task, order, &observation),
             observation,
             previous_reward: 0.0,
             actions: vec![0; n_agents],
-        }
+        })
     }
 }
 
@@ -172,22 +235,30 @@ impl Running {
         }
     }
 
-    /// Plays the joint action; returns how the episode ended once it has.
-    fn step(&mut self) -> Option<(End, bool)> {
-        let step = self.world.step(&self.actions, &mut self.environment_rng);
+    /// Waits for what the joint action leads to; returns how the episode ended once it has.
+    fn step(&mut self) -> Result<Option<(End, bool)>, EnvironmentError> {
+        let step = self.world.step(&mut self.environment_rng)?;
         self.world.observe(&mut self.observation);
         self.builder.step(&self.actions, step.reward, step.shaping, &self.observation);
         self.previous_reward = step.reward;
         self.steps += 1;
         let cut_off = self.time_limit.is_some_and(|limit| self.steps >= limit);
-        step.end.map(|end| (if cut_off { End::Truncated } else { end }, step.won))
+        Ok(step.end.map(|end| (if cut_off { End::Truncated } else { end }, step.won)))
     }
+}
+
+/// The episodes of jobs none of which was lost.
+///
+/// # Errors
+/// The first that was.
+pub fn all_rolled(rolled: Vec<Rolled>) -> Result<Vec<Episode>, LostEpisode> {
+    rolled.into_iter().collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Split, TaskSet, particle::Script};
+    use crate::{Script, Split, TaskSet};
     use rit_episode::decision_order::is_permutation;
 
     /// Plays a fixed action by row.
@@ -218,10 +289,11 @@ mod tests {
 
     #[test]
     fn an_episode_is_the_same_whoever_rolls_beside_it() {
-        let all = rollout(3, true).roll(&mut Fixed([0, 2]), &jobs(0..20));
+        let all = all_rolled(rollout(3, true).roll(&mut Fixed([0, 2]), &jobs(0..20))).unwrap();
         for (number, episode) in all.iter().enumerate() {
             let number = number as u64;
-            let alone = rollout(3, true).roll(&mut Fixed([0, 2]), &jobs(number..number + 1));
+            let alone =
+                all_rolled(rollout(3, true).roll(&mut Fixed([0, 2]), &jobs(number..number + 1))).unwrap();
             assert_eq!(alone, std::slice::from_ref(episode));
         }
         let tasks: std::collections::HashSet<_> = all.iter().map(|episode| episode.task).collect();
@@ -234,7 +306,7 @@ mod tests {
         // when agent 0 decides first; game 4 is won by (a¹, a¹), whoever is first.
         let jobs: Vec<Job> =
             (0..40).map(|number| Job { task: Some(0), ..jobs(number..number + 1)[0] }).collect();
-        let episodes = rollout(5, true).roll(&mut Fixed([0, 2]), &jobs);
+        let episodes = all_rolled(rollout(5, true).roll(&mut Fixed([0, 2]), &jobs)).unwrap();
         for episode in &episodes {
             assert!(is_permutation(&episode.decision_order));
             assert_eq!(episode.won, episode.decision_order == [0, 1]);
@@ -247,7 +319,7 @@ mod tests {
             }
         }
         assert!(episodes.iter().any(|episode| episode.won) && episodes.iter().any(|episode| !episode.won));
-        let unpermuted = rollout(5, false).roll(&mut Fixed([0, 2]), &jobs);
+        let unpermuted = all_rolled(rollout(5, false).roll(&mut Fixed([0, 2]), &jobs)).unwrap();
         assert!(unpermuted.iter().all(|episode| episode.won && episode.end == End::Terminated));
     }
 
@@ -255,7 +327,7 @@ mod tests {
     fn an_end_at_the_time_limit_can_count_as_a_cut() {
         let end = |bootstraps| {
             let mut rollout = rollout(1, true).with_time_limit_bootstraps(bootstraps);
-            rollout.roll(&mut Fixed([0, 0]), &jobs(0..1))[0].end
+            all_rolled(rollout.roll(&mut Fixed([0, 0]), &jobs(0..1))).unwrap()[0].end
         };
         assert_eq!((end(false), end(true)), (End::Terminated, End::Truncated));
     }
@@ -267,10 +339,11 @@ mod tests {
             || Rollout::new(set.tasks(Split::Training), EnvironmentOptions::default(), RunSeed(2), true);
         let jobs = jobs(0..5);
         let mut seen = vec![Vec::new(); jobs.len()];
-        let episodes = new().roll_watched(&mut Script::Random, &jobs, |job, world| {
+        let watched = new().roll_watched(&mut Script::Random, &jobs, |job, world| {
             seen[job].push(world.scene().unwrap().bodies);
         });
-        assert_eq!(episodes, new().roll(&mut Script::Random, &jobs), "watching changes nothing");
+        let episodes = all_rolled(watched).unwrap();
+        assert_eq!(all_rolled(new().roll(&mut Script::Random, &jobs)).as_ref(), Ok(&episodes));
         for (scenes, episode) in seen.iter().zip(&episodes) {
             assert_eq!(scenes.len(), episode.steps() + 1);
             let rows = episode.entities.chunks_exact(set.dims().entity_dim).enumerate();
@@ -288,8 +361,9 @@ mod tests {
         for (view_radius, sees_others) in [(None, true), (Some(0.0), false)] {
             let tasks = TaskSet::CooperativeNavigation.tasks(Split::Training);
             let options = EnvironmentOptions { view_radius, ..EnvironmentOptions::default() };
-            let episodes = Rollout::new(tasks, options, RunSeed(1), true)
+            let rolled = Rollout::new(tasks, options, RunSeed(1), true)
                 .roll(&mut Fixed([0, 0]), &[Job { task: Some(0), ..jobs(0..1)[0] }]);
+            let episodes = all_rolled(rolled).unwrap();
             let rows = episodes[0].observable.chunks_exact(4).enumerate();
             for (row, seen) in rows {
                 let itself_only = [[1, 0, 0, 0], [0, 1, 0, 0]][row % 2];

@@ -1,6 +1,6 @@
 //! An environment seen in decision order.
 
-use crate::{Environment, Step};
+use crate::{Environment, EnvironmentError, Spec, Step};
 use rit_episode::{Action, Observation, Rng, decision_order};
 
 /// An environment whose agents sit in decision order: row k is the k-th to decide. The order reorders every
@@ -8,6 +8,7 @@ use rit_episode::{Action, Observation, Rng, decision_order};
 /// features are followed by the one-hot of its last action: zeros at the first step and for non-agents.
 pub struct Seated {
     environment: Box<dyn Environment>,
+    spec: Spec,
     decision_order: Vec<u8>,
     /// The environment's own view, agents in its own order.
     inner: Observation,
@@ -18,13 +19,14 @@ pub struct Seated {
 impl Seated {
     /// Takes an environment; [`Seated::reset`] comes before anything else.
     pub fn new(environment: Box<dyn Environment>) -> Self {
-        let decision_order = decision_order::identity(environment.n_agents());
-        Self { environment, decision_order, inner: Observation::default(), last_actions: None }
+        let spec = environment.spec();
+        let decision_order = decision_order::identity(spec.n_agents);
+        Self { environment, spec, decision_order, inner: Observation::default(), last_actions: None }
     }
 
-    /// Features of one entity, its last action included: d.
-    pub fn entity_dim(&self) -> usize {
-        self.environment.feature_dim() + self.environment.n_actions()
+    /// What the environment's task is.
+    pub fn spec(&self) -> &Spec {
+        &self.spec
     }
 
     /// The environment itself.
@@ -32,22 +34,32 @@ impl Seated {
         self.environment.as_ref()
     }
 
-    /// Begins an episode in this decision order.
+    /// Tells the environment that an episode in this decision order will begin; [`Self::reset`] follows.
+    ///
+    /// # Errors
+    /// When the environment cannot be told.
     ///
     /// # Panics
     /// When the order is not a permutation of the environment's agents.
-    pub fn reset(&mut self, order: Vec<u8>, rng: &mut Rng) {
-        assert_eq!(order.len(), self.environment.n_agents(), "one place for each agent");
+    pub fn begin_reset(&mut self, order: Vec<u8>, rng: &mut Rng) -> Result<(), EnvironmentError> {
+        assert_eq!(order.len(), self.spec.n_agents, "one place for each agent");
         assert!(decision_order::is_permutation(&order), "a decision order is a permutation");
         self.decision_order = order;
         self.last_actions = None;
-        self.environment.reset(rng);
+        self.environment.begin_reset(rng)
+    }
+
+    /// Begins the episode.
+    ///
+    /// # Errors
+    /// When it did not begin.
+    pub fn reset(&mut self, rng: &mut Rng) -> Result<(), EnvironmentError> {
+        self.environment.reset(rng)
     }
 
     /// The state with agents in decision order.
     pub fn observe(&mut self, observation: &mut Observation) {
-        let (n, m) = (self.environment.n_agents(), self.environment.n_entities());
-        let (features, n_actions) = (self.environment.feature_dim(), self.environment.n_actions());
+        let Spec { n_agents: n, n_entities: m, feature_dim: features, n_actions, .. } = self.spec;
         self.inner.reset(n, m, features, n_actions);
         self.environment.observe(&mut self.inner);
 
@@ -70,14 +82,25 @@ impl Seated {
         }
     }
 
-    /// Takes a joint action in decision order.
-    pub fn step(&mut self, actions: &[Action], rng: &mut Rng) -> Step {
+    /// Tells the environment a joint action in decision order; [`Self::step`] follows.
+    ///
+    /// # Errors
+    /// When the environment cannot be told.
+    pub fn begin_step(&mut self, actions: &[Action]) -> Result<(), EnvironmentError> {
         let last = self.last_actions.get_or_insert_default();
         last.resize(actions.len(), 0);
         for (&agent, &action) in self.decision_order.iter().zip(actions) {
             last[usize::from(agent)] = action;
         }
-        self.environment.step(last, rng)
+        self.environment.begin_step(last)
+    }
+
+    /// What the joint action told last leads to.
+    ///
+    /// # Errors
+    /// When the environment cannot go on.
+    pub fn step(&mut self, rng: &mut Rng) -> Result<Step, EnvironmentError> {
+        self.environment.step(self.last_actions.get_or_insert_default(), rng)
     }
 
     /// The environment's entity that sits in this row.
@@ -95,27 +118,22 @@ mod tests {
     struct Labelled;
 
     impl Environment for Labelled {
-        fn n_agents(&self) -> usize {
-            3
+        fn spec(&self) -> Spec {
+            Spec {
+                n_agents: 3,
+                n_entities: 4,
+                feature_dim: 1,
+                n_actions: 2,
+                steps_max: 1,
+                has_wins: false,
+                has_scenes: false,
+                is_reproducible: true,
+            }
         }
 
-        fn n_entities(&self) -> usize {
-            4
+        fn reset(&mut self, _: &mut Rng) -> Result<(), EnvironmentError> {
+            Ok(())
         }
-
-        fn feature_dim(&self) -> usize {
-            1
-        }
-
-        fn n_actions(&self) -> usize {
-            2
-        }
-
-        fn steps_max(&self) -> usize {
-            1
-        }
-
-        fn reset(&mut self, _: &mut Rng) {}
 
         fn observe(&self, observation: &mut Observation) {
             for entity in 0..4 {
@@ -128,10 +146,10 @@ mod tests {
             }
         }
 
-        fn step(&mut self, actions: &[Action], _: &mut Rng) -> Step {
+        fn step(&mut self, actions: &[Action], _: &mut Rng) -> Result<Step, EnvironmentError> {
             // What it was told, agent 0's action first.
             let told = actions.iter().fold(0.0, |told, &action| 10.0 * told + f32::from(action));
-            Step { reward: told, shaping: 0.0, end: None, won: false }
+            Ok(Step { reward: told, shaping: 0.0, end: None, won: false })
         }
     }
 
@@ -140,7 +158,8 @@ mod tests {
         let mut rng = RunSeed(0).stream(Stream::Environment, 0);
         let (mut seated, mut seen) = (Seated::new(Box::new(Labelled)), Observation::default());
         // Agent 2 decides first, then 0, then 1.
-        seated.reset(vec![2, 0, 1], &mut rng);
+        seated.begin_reset(vec![2, 0, 1], &mut rng).unwrap();
+        seated.reset(&mut rng).unwrap();
         seated.observe(&mut seen);
         // Feature, last action.
         assert_eq!(seen.entities(), [2., 0., 0., 0., 0., 0., 1., 0., 0., 3., 0., 0.]);
@@ -148,8 +167,12 @@ mod tests {
         assert_eq!(seen.available(), [20, 21, 0, 1, 10, 11]);
 
         // The first to decide, agent 2, takes action 1, agent 0 action 0, agent 1 action 1.
-        assert_eq!(seated.step(&[1, 0, 1], &mut rng).reward, 11.0);
-        assert_eq!(seated.step(&[0, 0, 1], &mut rng).reward, 10.0);
+        let mut told = |actions: &[Action]| {
+            seated.begin_step(actions).unwrap();
+            seated.step(&mut rng).unwrap().reward
+        };
+        assert_eq!(told(&[1, 0, 1]), 11.0);
+        assert_eq!(told(&[0, 0, 1]), 10.0);
         seated.observe(&mut seen);
         assert_eq!(seen.entities(), [2., 1., 0., 0., 1., 0., 1., 0., 1., 3., 0., 0.]);
     }

@@ -1,7 +1,8 @@
 //! Which tasks belong together: training tasks to learn from, testing tasks for zero-shot evaluation.
 
 use crate::{
-    Environment, EnvironmentOptions, UnknownName,
+    Environment, EnvironmentOptions, Spec, UnknownName,
+    combat::{Combat, CombatSet, Team, TeamError},
     matrix_game::MatrixGame,
     particle::{CooperativeNavigation, PredatorPrey, PredatorPreyReward},
 };
@@ -15,7 +16,7 @@ const TESTING_HUNTS: [(usize, usize); 2] = [(4, 2), (5, 2)];
 
 /// The task sets of the paper's section VI.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
+#[serde(try_from = "String", into = "String")]
 pub enum TaskSet {
     /// Four two-step matrix games (table I).
     MatrixGame,
@@ -25,6 +26,8 @@ pub enum TaskSet {
     PredatorPrey,
     /// The predator and prey series pro.
     PredatorPreyPro,
+    /// StarCraft micro-combat.
+    Combat(CombatSet),
 }
 
 /// Tasks are trained on or kept for zero-shot evaluation.
@@ -58,12 +61,53 @@ pub enum Task {
         /// Which series it belongs to.
         reward: PredatorPreyReward,
     },
+    /// A battle of two teams.
+    Combat {
+        /// The set, which says what units look like.
+        set: CombatSet,
+        /// The agents' team.
+        allies: Team,
+        /// The opponent's.
+        enemies: Team,
+    },
+}
+
+/// Between the teams of a battle's name, where they differ.
+const VERSUS: &str = "-vs-";
+/// Most agents of a task that no list names, and most landmarks or prey.
+const SIZE_MAX: usize = 64;
+
+/// A name that is no task of a set.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum TaskError {
+    /// Its sizes are none that the set can have.
+    #[error("{name}: {what} must be 1 to {SIZE_MAX}")]
+    Size {
+        /// The name.
+        name: String,
+        /// Which size.
+        what: &'static str,
+    },
+    /// Its team cannot fight.
+    #[error(transparent)]
+    Team(#[from] TeamError),
+    /// It names nothing.
+    #[error(transparent)]
+    Unknown(#[from] UnknownName),
 }
 
 impl TaskSet {
     /// Every task set.
-    pub const ALL: [Self; 4] =
-        [Self::MatrixGame, Self::CooperativeNavigation, Self::PredatorPrey, Self::PredatorPreyPro];
+    pub const ALL: [Self; 8] = [
+        Self::MatrixGame,
+        Self::CooperativeNavigation,
+        Self::PredatorPrey,
+        Self::PredatorPreyPro,
+        Self::Combat(CombatSet::Marines),
+        Self::Combat(CombatSet::StalkersZealots),
+        Self::Combat(CombatSet::MarinesMaraudersMedivacs),
+        Self::Combat(CombatSet::ColossiStalkersZealots),
+    ];
 
     /// The tasks of one split, in a fixed order: a task's index is its place among the training tasks.
     pub fn tasks(self, split: Split) -> Vec<Task> {
@@ -78,22 +122,60 @@ impl TaskSet {
             (Self::PredatorPrey, Split::Testing) => hunts(PredatorPreyReward::Plain, TESTING_HUNTS),
             (Self::PredatorPreyPro, Split::Training) => hunts(PredatorPreyReward::Pro, TRAINING_HUNTS),
             (Self::PredatorPreyPro, Split::Testing) => hunts(PredatorPreyReward::Pro, TESTING_HUNTS),
+            (Self::Combat(set), Split::Training) => battles(set, &set.teams()[..set.n_training()]),
+            (Self::Combat(set), Split::Testing) => battles(set, &set.teams()[set.n_training()..]),
         }
     }
 
-    /// The task of this name, be it for training or for testing.
+    /// The task of this name: one of the set's lists, or any other of its kind, such as `navigation-8-8`,
+    /// `predator-prey-6-3`, `5s3z` or `3m-vs-4m`.
     ///
     /// # Errors
     /// When no task of the set is called so.
-    pub fn task(self, name: &str) -> Result<Task, UnknownName> {
-        let tasks = [self.tasks(Split::Training), self.tasks(Split::Testing)].concat();
-        UnknownName::look_up("task", name, &tasks)
+    pub fn task(self, name: &str) -> Result<Task, TaskError> {
+        let listed = [self.tasks(Split::Training), self.tasks(Split::Testing)].concat();
+        let unknown = match UnknownName::look_up("task", name, &listed) {
+            Ok(task) => return Ok(task),
+            Err(unknown) => unknown,
+        };
+        let sizes = |prefix: &str| {
+            let (first, second) = name.strip_prefix(prefix)?.strip_prefix('-')?.split_once('-')?;
+            first.parse::<usize>().ok().zip(second.parse::<usize>().ok())
+        };
+        let in_range = |size: usize, what| match size {
+            1..=SIZE_MAX => Ok(size),
+            _ => Err(TaskError::Size { name: name.to_owned(), what }),
+        };
+        let hunt = |prefix, reward| {
+            let Some((predators, prey)) = sizes(prefix) else { return Err(unknown.clone().into()) };
+            let (predators, prey) = (in_range(predators, "predators")?, in_range(prey, "prey")?);
+            Ok(Task::PredatorPrey { predators, prey, reward })
+        };
+        match self {
+            Self::MatrixGame => Err(unknown.into()),
+            Self::CooperativeNavigation => match sizes("navigation") {
+                Some((n, landmarks)) if n == landmarks => {
+                    Ok(Task::CooperativeNavigation { n: in_range(n, "agents")? })
+                }
+                _ => Err(unknown.into()),
+            },
+            Self::PredatorPrey => hunt("predator-prey", PredatorPreyReward::Plain),
+            Self::PredatorPreyPro => hunt("predator-prey-pro", PredatorPreyReward::Pro),
+            Self::Combat(set) => {
+                let (allies, enemies) = name.split_once(VERSUS).unwrap_or((name, name));
+                Ok(Task::Combat {
+                    set,
+                    allies: Team::parse(allies, set)?,
+                    enemies: Team::parse(enemies, set)?,
+                })
+            }
+        }
     }
 
     /// Whether its tasks know winning.
     pub fn has_wins(self) -> bool {
         match self {
-            Self::MatrixGame => true,
+            Self::MatrixGame | Self::Combat(_) => true,
             Self::CooperativeNavigation | Self::PredatorPrey | Self::PredatorPreyPro => false,
         }
     }
@@ -102,31 +184,34 @@ impl TaskSet {
     pub fn has_prey(self) -> bool {
         match self {
             Self::PredatorPrey | Self::PredatorPreyPro => true,
-            Self::MatrixGame | Self::CooperativeNavigation => false,
+            Self::MatrixGame | Self::CooperativeNavigation | Self::Combat(_) => false,
         }
     }
 
-    /// Whether its entities have places, so that some are nearer than others.
-    pub fn has_places(self) -> bool {
+    /// Whether a radius limits what agents see in its tasks.
+    pub fn has_view_radius(self) -> bool {
         match self {
             Self::CooperativeNavigation | Self::PredatorPrey | Self::PredatorPreyPro => true,
-            Self::MatrixGame => false,
+            Self::MatrixGame | Self::Combat(_) => false,
         }
     }
 
     /// The padded sizes over all its tasks, testing tasks included (paper, appendix A).
     pub fn dims(self) -> Dims {
-        let tasks = [Split::Training, Split::Testing].into_iter().flat_map(|split| self.tasks(split));
+        Self::dims_of([Split::Training, Split::Testing].into_iter().flat_map(|split| self.tasks(split)))
+    }
+
+    /// The padded sizes over these tasks.
+    pub fn dims_of(tasks: impl IntoIterator<Item = Task>) -> Dims {
         let mut dims = Dims { entity_dim: 0, n_actions: 0, agents_max: 0, entities_max: 0, steps_max: 0 };
         let mut others_max = 0;
         for task in tasks {
-            // No option changes a size.
-            let environment = task.environment(EnvironmentOptions::default());
-            dims.entity_dim = environment.feature_dim() + environment.n_actions();
-            dims.n_actions = environment.n_actions();
-            dims.agents_max = dims.agents_max.max(environment.n_agents());
-            others_max = others_max.max(environment.n_entities() - environment.n_agents());
-            dims.steps_max = dims.steps_max.max(environment.steps_max());
+            let spec = task.spec();
+            dims.entity_dim = spec.entity_dim();
+            dims.n_actions = spec.n_actions;
+            dims.agents_max = dims.agents_max.max(spec.n_agents);
+            others_max = others_max.max(spec.n_entities - spec.n_agents);
+            dims.steps_max = dims.steps_max.max(spec.steps_max);
         }
         Dims { entities_max: dims.agents_max + others_max, ..dims }
     }
@@ -144,13 +229,26 @@ impl Task {
             Self::PredatorPrey { predators, prey, reward } => {
                 Box::new(PredatorPrey::new(predators, prey, reward, options))
             }
+            Self::Combat { set, allies, enemies } => {
+                Box::new(Combat::new(set, [allies, enemies], options.combat))
+            }
+        }
+    }
+
+    /// What the task is, as data: nothing is built for it.
+    pub fn spec(self) -> Spec {
+        match self {
+            Self::MatrixGame { .. } => MatrixGame::SPEC,
+            Self::CooperativeNavigation { n } => CooperativeNavigation::spec(n),
+            Self::PredatorPrey { predators, prey, .. } => PredatorPrey::spec(predators, prey),
+            Self::Combat { set, allies, enemies } => Combat::spec(set, [allies, enemies]),
         }
     }
 
     /// The task's real sizes.
     pub fn size(self) -> TaskSize {
-        let environment = self.environment(EnvironmentOptions::default());
-        TaskSize { n_agents: environment.n_agents(), n_entities: environment.n_entities() }
+        let Spec { n_agents, n_entities, .. } = self.spec();
+        TaskSize { n_agents, n_entities }
     }
 }
 
@@ -161,7 +259,22 @@ impl fmt::Display for TaskSet {
             Self::CooperativeNavigation => "cooperative-navigation",
             Self::PredatorPrey => "predator-prey",
             Self::PredatorPreyPro => "predator-prey-pro",
+            Self::Combat(set) => return set.fmt(f),
         })
+    }
+}
+
+impl TryFrom<String> for TaskSet {
+    type Error = UnknownName;
+
+    fn try_from(name: String) -> Result<Self, UnknownName> {
+        name.parse()
+    }
+}
+
+impl From<TaskSet> for String {
+    fn from(task_set: TaskSet) -> Self {
+        task_set.to_string()
     }
 }
 
@@ -177,6 +290,8 @@ impl fmt::Display for Task {
                 };
                 write!(f, "{series}-{predators}-{prey}")
             }
+            Self::Combat { allies, enemies, .. } if allies == enemies => allies.fmt(f),
+            Self::Combat { allies, enemies, .. } => write!(f, "{allies}{VERSUS}{enemies}"),
         }
     }
 }
@@ -191,6 +306,10 @@ impl FromStr for TaskSet {
 
 fn navigation<const N: usize>(sizes: [usize; N]) -> Vec<Task> {
     sizes.map(|n| Task::CooperativeNavigation { n }).to_vec()
+}
+
+fn battles(set: CombatSet, teams: &[Team]) -> Vec<Task> {
+    teams.iter().map(|&team| Task::Combat { set, allies: team, enemies: team }).collect()
 }
 
 fn hunts<const N: usize>(reward: PredatorPreyReward, sizes: [(usize, usize); N]) -> Vec<Task> {
@@ -213,7 +332,8 @@ mod tests {
             for task in all_tasks(set) {
                 conformance::check(|| task.environment(EnvironmentOptions::default()));
             }
-            let short_sighted = EnvironmentOptions { view_radius: Some(0.5), approach_shaping: 0.5 };
+            let short_sighted =
+                EnvironmentOptions { view_radius: Some(0.5), approach_shaping: 0.5, ..Default::default() };
             conformance::check(|| set.tasks(Split::Training)[0].environment(short_sighted));
         }
     }
@@ -267,10 +387,46 @@ mod tests {
         }
         let unknown = "matrixgame".parse::<TaskSet>().unwrap_err();
         assert!(unknown.to_string().starts_with("unknown task set \"matrixgame\"; known: matrix-game"));
+        assert_eq!(TaskSet::Combat(CombatSet::Marines).to_string(), "3-8m");
         assert_eq!(
             TaskSet::CooperativeNavigation.task("predator-prey-3-1").unwrap_err().to_string(),
             "unknown task \"predator-prey-3-1\"; known: navigation-2-2, navigation-3-3, navigation-4-4, \
              navigation-5-5, navigation-6-6"
         );
+    }
+
+    #[test]
+    fn tasks_beyond_the_lists_have_names_too() {
+        for (set, name) in [
+            (TaskSet::CooperativeNavigation, "navigation-8-8"),
+            (TaskSet::PredatorPrey, "predator-prey-6-3"),
+            (TaskSet::PredatorPreyPro, "predator-prey-pro-2-2"),
+            (TaskSet::Combat(CombatSet::StalkersZealots), "1s7z"),
+            (TaskSet::Combat(CombatSet::Marines), "3m-vs-4m"),
+        ] {
+            assert_eq!(set.task(name).map(|task| task.to_string()).as_deref(), Ok(name));
+        }
+        let refused = |set: TaskSet, name: &str| set.task(name).unwrap_err().to_string();
+        assert_eq!(
+            refused(TaskSet::CooperativeNavigation, "navigation-0-0"),
+            "navigation-0-0: agents must be 1 to 64"
+        );
+        assert_eq!(refused(TaskSet::Combat(CombatSet::Marines), "9m"), "9m has 9 units; a side has 1 to 8");
+        for name in ["navigation-2-3", "navigation-2", "navigation--2-2", "game-5", ""] {
+            assert!(refused(TaskSet::CooperativeNavigation, name).starts_with("unknown task"), "{name}");
+        }
+    }
+
+    /// A spec says what its world does.
+    #[test]
+    fn specs_are_the_worlds_own() {
+        for set in TaskSet::ALL {
+            for task in all_tasks(set) {
+                let environment = task.environment(EnvironmentOptions::default());
+                assert_eq!(environment.spec(), task.spec(), "{task}");
+                assert_eq!(task.spec().has_wins, set.has_wins());
+                assert_eq!(environment.scene().is_some(), task.spec().has_scenes, "{task}");
+            }
+        }
     }
 }

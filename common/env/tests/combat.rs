@@ -37,18 +37,17 @@ fn battle(
     mut act: impl FnMut(&mut Turn<'_>),
     mut look: impl FnMut(&Combat),
 ) -> (f32, bool) {
+    let spec = combat.spec();
     let rng = &mut SEED.stream(Stream::Environment, number);
-    let mut exploration =
-        Exploration::new(0.0, 0.0, combat.n_agents(), SEED.stream(Stream::Exploration, number));
-    combat.reset(rng);
+    let mut exploration = Exploration::new(0.0, 0.0, spec.n_agents, SEED.stream(Stream::Exploration, number));
+    combat.reset(rng).unwrap();
     look(combat);
-    let mut actions: Vec<Action> = vec![0; combat.n_agents()];
+    let mut actions: Vec<Action> = vec![0; spec.n_agents];
     let mut total = 0.0;
     loop {
         // As an actor shows it: features, then room for the last action.
-        let width = combat.feature_dim() + combat.n_actions();
-        let mut observation =
-            Observation::new(combat.n_agents(), combat.n_entities(), width, combat.n_actions());
+        let width = spec.entity_dim();
+        let mut observation = Observation::new(spec.n_agents, spec.n_entities, width, spec.n_actions);
         combat.observe(&mut observation);
         let mut turn = Turn {
             slot: 0,
@@ -61,7 +60,7 @@ fn battle(
         for (agent, &action) in actions.iter().enumerate() {
             assert!(observation.allows(agent, action), "agent {agent} plays {action}");
         }
-        let step = combat.step(&actions, rng);
+        let step = combat.step(&actions, rng).unwrap();
         total += step.reward;
         look(combat);
         if step.end.is_some() {

@@ -1,8 +1,8 @@
 //! Cooperative navigation (paper, section VI-A): n agents cover n landmarks without running into each other.
 //! Original "simple spread" rewards, paid as their sum over agents.
 
-use super::world::{Body, DIRECTIONS, FEATURES, STEPS, World, squared_distance_to_nearest};
-use crate::{BodyKind, Environment, EnvironmentOptions, Scene, Step};
+use super::world::{Body, World, spec, squared_distance_to_nearest};
+use crate::{BodyKind, Environment, EnvironmentError, EnvironmentOptions, Scene, Spec, Step};
 use rit_episode::{Action, Observation, Rng};
 
 const AGENT: Body =
@@ -16,6 +16,11 @@ pub struct CooperativeNavigation {
 }
 
 impl CooperativeNavigation {
+    /// What the task is.
+    pub fn spec(n: usize) -> Spec {
+        spec(n, 2 * n)
+    }
+
     /// The task of `n` agents and as many landmarks.
     ///
     /// # Panics
@@ -44,40 +49,23 @@ impl CooperativeNavigation {
 }
 
 impl Environment for CooperativeNavigation {
-    fn n_agents(&self) -> usize {
-        self.world.n_agents()
+    fn spec(&self) -> Spec {
+        Self::spec(self.world.n_agents())
     }
 
-    fn n_entities(&self) -> usize {
-        self.world.n_entities()
-    }
-
-    /// Position (2), velocity (2), the kind's one-hot (3).
-    fn feature_dim(&self) -> usize {
-        FEATURES
-    }
-
-    /// None, −x, +x, −y, +y.
-    fn n_actions(&self) -> usize {
-        DIRECTIONS.len()
-    }
-
-    fn steps_max(&self) -> usize {
-        STEPS
-    }
-
-    fn reset(&mut self, rng: &mut Rng) {
+    fn reset(&mut self, rng: &mut Rng) -> Result<(), EnvironmentError> {
         self.world.reset(rng);
+        Ok(())
     }
 
     fn observe(&self, observation: &mut Observation) {
         self.world.observe(observation);
     }
 
-    fn step(&mut self, actions: &[Action], _: &mut Rng) -> Step {
+    fn step(&mut self, actions: &[Action], _: &mut Rng) -> Result<Step, EnvironmentError> {
         self.world.set_forces(actions);
         let end = self.world.advance();
-        Step { reward: self.team_reward(), shaping: 0.0, end, won: false }
+        Ok(Step { reward: self.team_reward(), shaping: 0.0, end, won: false })
     }
 
     fn scene(&self) -> Option<Scene> {

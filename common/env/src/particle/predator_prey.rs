@@ -4,11 +4,8 @@
 //! The paper states neither the scale of the prey's rule nor the pro series' penalty; both are inferred from
 //! its figures.
 
-use super::world::{
-    Body, DIRECTIONS, FEATURES, STEPS, Vector, World, scaled, squared_distance, squared_distance_to_nearest,
-    sum,
-};
-use crate::{BodyKind, Environment, EnvironmentOptions, Scene, Step};
+use super::world::{Body, Vector, World, scaled, spec, squared_distance, squared_distance_to_nearest, sum};
+use crate::{BodyKind, Environment, EnvironmentError, EnvironmentOptions, Scene, Spec, Step};
 use rand::RngExt as _;
 use rit_episode::{Action, Observation, Rng};
 
@@ -55,6 +52,11 @@ pub struct PredatorPrey {
 }
 
 impl PredatorPrey {
+    /// What the task is.
+    pub fn spec(predators: usize, prey: usize) -> Spec {
+        spec(predators, predators + OBSTACLES + prey)
+    }
+
     /// The task of this many predators and prey.
     ///
     /// # Panics
@@ -111,37 +113,20 @@ impl PredatorPrey {
 }
 
 impl Environment for PredatorPrey {
-    fn n_agents(&self) -> usize {
-        self.world.n_agents()
+    fn spec(&self) -> Spec {
+        Self::spec(self.predators().len(), self.prey().len())
     }
 
-    fn n_entities(&self) -> usize {
-        self.world.n_entities()
-    }
-
-    /// Position (2), velocity (2), the kind's one-hot (3).
-    fn feature_dim(&self) -> usize {
-        FEATURES
-    }
-
-    /// None, −x, +x, −y, +y.
-    fn n_actions(&self) -> usize {
-        DIRECTIONS.len()
-    }
-
-    fn steps_max(&self) -> usize {
-        STEPS
-    }
-
-    fn reset(&mut self, rng: &mut Rng) {
+    fn reset(&mut self, rng: &mut Rng) -> Result<(), EnvironmentError> {
         self.world.reset(rng);
+        Ok(())
     }
 
     fn observe(&self, observation: &mut Observation) {
         self.world.observe(observation);
     }
 
-    fn step(&mut self, actions: &[Action], rng: &mut Rng) -> Step {
+    fn step(&mut self, actions: &[Action], rng: &mut Rng) -> Result<Step, EnvironmentError> {
         self.world.set_forces(actions);
         // All prey decide by the state that the predators saw.
         for index in self.first_prey()..self.world.n_entities() {
@@ -152,7 +137,7 @@ impl Environment for PredatorPrey {
         let distances = (self.approach_shaping != 0.0).then(|| self.distances_to_prey());
         let end = self.world.advance();
         let nearer = distances.map_or(0.0, |before| before - self.distances_to_prey());
-        Step { reward: self.team_reward(), shaping: self.approach_shaping * nearer, end, won: false }
+        Ok(Step { reward: self.team_reward(), shaping: self.approach_shaping * nearer, end, won: false })
     }
 
     fn scene(&self) -> Option<Scene> {

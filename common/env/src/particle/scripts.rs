@@ -1,91 +1,18 @@
-//! Scripted policies: reference points between which a learned policy's reward can be placed.
+//! Scripted policies of the particle worlds.
 
 use super::world::{
     KIND, POSITION, VELOCITY, Vector, scaled, squared_distance, squared_distance_to_nearest, sum,
 };
-use crate::{BodyKind, TaskSet, UnknownName};
-use rit_episode::{Action, Observation, Policy, Turn};
-use std::{fmt, str::FromStr};
+use crate::BodyKind;
+use rit_episode::{Action, Observation, Turn};
 
 /// What a body without force still travels, per unit of velocity: Δt (0.75 + 0.75² + …) = 0.3.
 const COAST: f32 = 0.3;
 /// An agent that will come to rest this near to its target does not accelerate: a landmark's radius.
 const CLOSE_ENOUGH: f32 = 0.05;
 
-/// A policy without parameters. It reads the whole state, also what an agent does not see: it is a reference
-/// point, not a rival.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Script {
-    /// Any available action, uniformly. For every environment.
-    Random,
-    /// Action 0 always. For every environment in which it is available.
-    Still,
-    /// Each agent to a landmark of its own, by the assignment of least total distance at each step. Made for
-    /// cooperative navigation; needs the features of a particle world.
-    NearestAssignment,
-    /// All predators to the same prey, at each step the one that is nearest to any of them. Made for predator
-    /// and prey; needs the features of a particle world.
-    Chase,
-}
-
-impl Script {
-    /// Every script.
-    pub const ALL: [Self; 4] = [Self::Random, Self::Still, Self::NearestAssignment, Self::Chase];
-
-    /// Whether it has something to do in the tasks of this set.
-    ///
-    /// # Errors
-    /// When it was made for others: it would stand still, or look for features that are not there.
-    pub fn check(self, task_set: TaskSet) -> Result<(), UnfitScript> {
-        if self.fits(task_set) { Ok(()) } else { Err(UnfitScript { script: self, task_set }) }
-    }
-
-    fn fits(self, task_set: TaskSet) -> bool {
-        match self {
-            Self::Random | Self::Still => true,
-            Self::NearestAssignment => task_set == TaskSet::CooperativeNavigation,
-            Self::Chase => matches!(task_set, TaskSet::PredatorPrey | TaskSet::PredatorPreyPro),
-        }
-    }
-}
-
-/// A script made for other tasks.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("script {script} is not made for {task_set}; those that are: {}", fitting(*task_set))]
-pub struct UnfitScript {
-    /// The script.
-    pub script: Script,
-    /// The task set it does not fit.
-    pub task_set: TaskSet,
-}
-
-fn fitting(task_set: TaskSet) -> String {
-    let fitting = Script::ALL.into_iter().filter(|script| script.fits(task_set));
-    fitting.map(|script| script.to_string()).collect::<Vec<_>>().join(", ")
-}
-
-impl Policy for Script {
-    fn begin(&mut self, _: usize, _: usize) {}
-
-    fn act(&mut self, turns: &mut [Turn<'_>]) {
-        for turn in turns {
-            match self {
-                Self::Random => act_randomly(turn),
-                Self::Still => turn.actions.fill(0),
-                Self::NearestAssignment => act_by_nearest_assignment(turn),
-                Self::Chase => chase(turn),
-            }
-        }
-    }
-}
-
-fn act_randomly(turn: &mut Turn<'_>) {
-    for (agent, to) in turn.actions.iter_mut().enumerate() {
-        *to = turn.exploration.any(turn.observation.available_to(agent));
-    }
-}
-
-fn act_by_nearest_assignment(turn: &mut Turn<'_>) {
+/// Each agent to a landmark of its own, by the assignment of least total distance.
+pub(crate) fn act_by_nearest_assignment(turn: &mut Turn<'_>) {
     let agents = positions(turn.observation, BodyKind::Agent);
     let landmarks = positions(turn.observation, BodyKind::Landmark);
     turn.actions.fill(0);
@@ -94,7 +21,8 @@ fn act_by_nearest_assignment(turn: &mut Turn<'_>) {
     }
 }
 
-fn chase(turn: &mut Turn<'_>) {
+/// All predators to the prey that is nearest to any of them.
+pub(crate) fn chase(turn: &mut Turn<'_>) {
     let predators = positions(turn.observation, BodyKind::Agent);
     let prey = positions(turn.observation, BodyKind::Prey);
     let distance = |&prey: &Vector| squared_distance_to_nearest(prey, predators.iter().copied());
@@ -169,25 +97,6 @@ fn features(observation: &Observation, entity: usize) -> &[f32] {
 
 fn vector(features: &[f32]) -> Vector {
     [features[0], features[1]]
-}
-
-impl fmt::Display for Script {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Random => "random",
-            Self::Still => "still",
-            Self::NearestAssignment => "nearest-assignment",
-            Self::Chase => "chase",
-        })
-    }
-}
-
-impl FromStr for Script {
-    type Err = UnknownName;
-
-    fn from_str(name: &str) -> Result<Self, UnknownName> {
-        UnknownName::look_up("script", name, &Self::ALL)
-    }
 }
 
 #[cfg(test)]

@@ -3,13 +3,13 @@
 //! All bodies have mass 1, so force and acceleration are the same number. Units are the original's own: the
 //! arena spans about ±1, a step lasts [`STEP_SECONDS`].
 
-use crate::{BodyKind, EnvironmentOptions, Scene, SceneBody};
+use crate::{BodyKind, EnvironmentOptions, Scene, SceneBody, Spec};
 use rand::RngExt as _;
 use rit_episode::{Action, End, Observation, Rng};
 use std::ops::Range;
 
 /// Steps of an episode.
-pub(super) const STEPS: usize = 25;
+const STEPS: usize = 25;
 /// Δt.
 const STEP_SECONDS: f32 = 0.1;
 /// What is left of a velocity after a step: 1 − damping.
@@ -32,7 +32,22 @@ pub(super) const VELOCITY: Range<usize> = 2..4;
 /// Columns that hold the one-hot of its [`BodyKind`], in the order of its variants.
 pub(super) const KIND: Range<usize> = 4..7;
 /// Features of one entity.
-pub(super) const FEATURES: usize = KIND.end;
+const FEATURES: usize = KIND.end;
+
+/// What a particle world is. Features are position (2), velocity (2) and the kind's one-hot (3); actions none, −x, +x,
+/// −y, +y.
+pub(super) fn spec(n_agents: usize, n_entities: usize) -> Spec {
+    Spec {
+        n_agents,
+        n_entities,
+        feature_dim: FEATURES,
+        n_actions: DIRECTIONS.len(),
+        steps_max: STEPS,
+        has_wins: false,
+        has_scenes: true,
+        is_reproducible: true,
+    }
+}
 
 /// x and y.
 pub(super) type Vector = [f32; 2];

@@ -33,7 +33,7 @@ fn pays_distances_and_overlaps_to_every_agent() {
 fn pays_for_the_state_that_the_step_leads_to() {
     // Agent 0 moves from 0 to 0.05 on its way to 0.55: 0.5 is missing. Agent 1 covers its landmark.
     let mut environment = placed([[0.0, 0.0], [2.0, 0.0], [0.55, 0.0], [2.0, 0.0]]);
-    let step = environment.step(&[2, 0], &mut RunSeed(0).stream(Stream::Environment, 0));
+    let step = environment.step(&[2, 0], &mut RunSeed(0).stream(Stream::Environment, 0)).unwrap();
     assert!((step.reward + 2.0 * 0.5 + 2.0).abs() < 1e-6, "{step:?}");
     assert_eq!((step.end, step.won), (None, false));
 }

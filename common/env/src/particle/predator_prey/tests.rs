@@ -57,7 +57,7 @@ fn shaping_pays_what_a_step_takes_off_the_distances_and_touches_no_reward() {
         let mut environment = PredatorPrey::new(2, 1, Pro, options);
         environment.world.place(&[&predators[..], &OBSTACLES_AT, &prey].concat());
         // The first goes right, towards the prey; the second stays.
-        let step = environment.step(&[2, 0], &mut stream(7));
+        let step = environment.step(&[2, 0], &mut stream(7)).unwrap();
         (step, environment.prey()[0].position)
     });
     let [(plain, at), (shaped, _)] = steps;
@@ -122,7 +122,7 @@ fn the_offset_is_the_prey_s_force_and_its_draws_are_pinned() {
     // either moves, in their order, from the same stream.
     let prey = [[0.0, 0.0], [9.0, 0.0]];
     let mut environment = placed(&[[-3.0, 0.0], [5.0, 0.0]], &prey, Plain);
-    environment.step(&[0, 0], &mut stream(3));
+    environment.step(&[0, 0], &mut stream(3)).unwrap();
 
     let mut rng = stream(3);
     let predators = predators_at(&[[-3.0, 0.0], [5.0, 0.0]]);
@@ -177,7 +177,7 @@ fn predators_and_prey_are_as_fast_as_they_should_be() {
     let mut rng = stream(0);
     let speeds: Vec<[f32; 2]> = (0..20)
         .map(|_| {
-            environment.step(&[2], &mut rng);
+            environment.step(&[2], &mut rng).unwrap().unwrap();
             [environment.predators()[0].velocity, environment.prey()[0].velocity].map(|v| v[0].hypot(v[1]))
         })
         .collect();
@@ -192,7 +192,7 @@ fn everyone_begins_in_a_square_and_obstacles_in_a_smaller_one() {
     let mut environment = PredatorPrey::new(3, 2, Plain, EnvironmentOptions::default());
     let mut farthest = [0.0_f32; 7];
     for episode in 0..500 {
-        environment.reset(&mut stream(episode));
+        environment.reset(&mut stream(episode)).unwrap();
         for (farthest, body) in farthest.iter_mut().zip(&environment.world.bodies) {
             *farthest = body.position.iter().fold(*farthest, |most, x| most.max(x.abs()));
         }

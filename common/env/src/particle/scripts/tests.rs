@@ -1,7 +1,8 @@
 use super::*;
+use crate::Script;
 use crate::{
     EnvironmentOptions, Split, TaskSet,
-    rollout::{Job, Rollout},
+    rollout::{Job, Rollout, all_rolled},
 };
 use rand::RngExt as _;
 use rit_episode::{Choice, Exploration, RunSeed, Stream};
@@ -17,8 +18,11 @@ fn mean_reward(set: TaskSet, mut script: Script, episodes: usize) -> (f64, f64) 
     };
     let jobs: Vec<Job> = (0..episodes).map(job).collect();
     let mut rollout = Rollout::new(tasks.clone(), EnvironmentOptions::default(), RunSeed(0), true);
-    let rewards: Vec<f64> =
-        rollout.roll(&mut script, &jobs).iter().map(rit_episode::Episode::total_reward).collect();
+    let rewards: Vec<f64> = all_rolled(rollout.roll(&mut script, &jobs))
+        .unwrap()
+        .iter()
+        .map(rit_episode::Episode::total_reward)
+        .collect();
     let n = episodes as f64;
     let mean = rewards.iter().sum::<f64>() / n;
     let variance = rewards.iter().map(|reward| (reward - mean).powi(2)).sum::<f64>() / (n - 1.0);
@@ -176,7 +180,7 @@ fn a_script_made_for_other_tasks_says_so() {
         assert_eq!(Script::Still.check(set), Ok(()));
         let found = [Script::NearestAssignment, Script::Chase].map(|script| script.check(set).is_ok());
         let expected = match set {
-            TaskSet::MatrixGame => [false, false],
+            TaskSet::MatrixGame | TaskSet::Combat(_) => [false, false],
             TaskSet::CooperativeNavigation => [true, false],
             TaskSet::PredatorPrey | TaskSet::PredatorPreyPro => [false, true],
         };
@@ -195,6 +199,6 @@ fn names_lead_back() {
     }
     assert_eq!(
         "hunt".parse::<Script>().unwrap_err().to_string(),
-        "unknown script \"hunt\"; known: random, still, nearest-assignment, chase"
+        "unknown script \"hunt\"; known: random, still, nearest-assignment, chase, nearest, focus, kite"
     );
 }
