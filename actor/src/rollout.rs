@@ -8,15 +8,43 @@ use rit_algo::{Acting, Model};
 use rit_config::Config;
 use rit_env::{
     Split,
-    rollout::{Job, Rollout},
+    rollout::{Job, LostEpisode, Rolled, Rollout},
 };
-use rit_episode::wire::{self, EncodeError, Frame, PayloadLayout, RunId};
+use rit_episode::{
+    Episode,
+    wire::{self, EncodeError, Frame, PayloadLayout, RunId},
+};
 use rit_proto::v1::{Lease, Snapshot};
 use std::sync::{
     Arc,
     atomic::{AtomicBool, Ordering},
 };
 use tokio::{runtime::Handle, sync::mpsc};
+
+/// An actor that loses so many episodes in a row ends: its environments do not work.
+const FAILURES_MAX: usize = 5;
+
+/// Episodes lost since the last that was not.
+#[derive(Debug, Default)]
+pub(crate) struct Failures(usize);
+
+impl Failures {
+    /// The episode, if there is one. A lost one is logged and left out: the learner misses it when the lease is done,
+    /// and hands its number out again.
+    fn note(&mut self, rolled: Rolled) -> Result<Option<Episode>, RolloutError> {
+        match rolled {
+            Ok(episode) => {
+                self.0 = 0;
+                Ok(Some(episode))
+            }
+            Err(lost) => {
+                self.0 += 1;
+                tracing::warn!(%lost, reason = lost.error.kind.name(), "an episode is lost");
+                if self.0 >= FAILURES_MAX { Err(RolloutError::Environment(lost)) } else { Ok(None) }
+            }
+        }
+    }
+}
 
 /// Why rolling ended.
 #[derive(Debug, thiserror::Error)]
@@ -34,6 +62,9 @@ pub enum RolloutError {
         /// Parameters of the model.
         expected: usize,
     },
+    /// Environments that fail again and again.
+    #[error("{FAILURES_MAX} episodes in a row were lost, the last: {0}")]
+    Environment(LostEpisode),
     /// An episode that does not fit the run's dims.
     #[error(transparent)]
     Encode(#[from] EncodeError),
@@ -51,6 +82,7 @@ pub(crate) struct Roller {
     pub(crate) run_id: RunId,
     pub(crate) actor: u32,
     pub(crate) weights: Weights,
+    pub(crate) failures: Failures,
     /// Set when the actor shall end: a blocked send is given up.
     pub(crate) stop: Arc<AtomicBool>,
 }
@@ -58,7 +90,7 @@ pub(crate) struct Roller {
 impl Roller {
     /// A rollout of the run's training tasks.
     pub(crate) fn rollout(config: &Config) -> Rollout {
-        let tasks = config.environment.task_set.tasks(Split::Training);
+        let tasks = config.tasks(Split::Training);
         let options = config.environment_options();
         let algorithm = &config.algorithm;
         Rollout::new(tasks, options, config.seed, algorithm.random_permutation)
@@ -94,7 +126,8 @@ impl Roller {
             let choice = self.model.method().exploring(lease.epsilon);
             let job = |&number| Job { number, weights_version: version, choice, task: None };
             let jobs: Vec<Job> = lease.episodes.iter().map(job).collect();
-            for episode in self.rollout.roll(acting, &jobs) {
+            for rolled in self.rollout.roll(acting, &jobs) {
+                let Some(episode) = self.failures.note(rolled)? else { continue };
                 wire::encode(&episode, &self.layout, self.run_id, self.actor, &mut frame)?;
                 self.sink.send(&frame, &give_up)?;
             }

@@ -1,7 +1,7 @@
 //! An actor process from its beginning to its end.
 
 use crate::{
-    rollout::{Roller, RolloutError},
+    rollout::{Failures, Roller, RolloutError},
     sink::{EpisodeSink, FrameStream},
     weights::Weights,
 };
@@ -247,7 +247,7 @@ impl Actor {
         *joined = true;
         let Welcome { actor, run_id, config } = welcome;
         let config: Config = resolve(&config, "the learner's configuration", &[])?;
-        let layout = PayloadLayout::new(config.environment.task_set.dims());
+        let layout = PayloadLayout::new(config.dims());
 
         let (leases, lease_queue) = mpsc::channel(1);
         let (done, lease_done) = mpsc::channel(1);
@@ -269,6 +269,7 @@ impl Actor {
             layout,
             run_id: run_id.try_into().map_err(|_| ActorError::RunId)?,
             actor,
+            failures: Failures::default(),
             weights: Weights::watch(client, config.algorithm.policy_lag)
                 .await
                 .map_err(RolloutError::Weights)?,

@@ -17,7 +17,7 @@ pub fn run(options: &EvaluateOptions) -> Result<ExitCode, Failure> {
     }
     let episodes = options.episodes.map_or(config.evaluation.episodes, |episodes| episodes as usize);
     let seed = player.seed(options.seed);
-    let results = evaluator.evaluate(player.policy.as_mut(), &tasks, episodes, seed);
+    let results = evaluator.evaluate(player.policy.as_mut(), &tasks, episodes, seed)?;
     if options.json {
         let output = serde_json::json!({
             "policy": player.name,

@@ -6,7 +6,7 @@ use std::{fs, path::Path, process::ExitCode};
 use toml::Table;
 
 /// Name and text of each, from `deploy/experiments/`.
-const EXPERIMENTS: [(&str, &str); 7] = [
+const EXPERIMENTS: [(&str, &str); 11] = [
     ("matrix-game", include_str!("../experiments/matrix-game.toml")),
     ("matrix-game-vdn", include_str!("../experiments/matrix-game-vdn.toml")),
     (
@@ -20,6 +20,10 @@ const EXPERIMENTS: [(&str, &str); 7] = [
     ("cooperative-navigation", include_str!("../experiments/cooperative-navigation.toml")),
     ("predator-prey", include_str!("../experiments/predator-prey.toml")),
     ("predator-prey-pro", include_str!("../experiments/predator-prey-pro.toml")),
+    ("3-8m", include_str!("../experiments/3-8m.toml")),
+    ("3-8sz", include_str!("../experiments/3-8sz.toml")),
+    ("3-8MMM", include_str!("../experiments/3-8MMM.toml")),
+    ("3-8csz", include_str!("../experiments/3-8csz.toml")),
 ];
 
 /// A resolved experiment and the name a run of it gets.

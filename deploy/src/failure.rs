@@ -2,7 +2,7 @@
 
 use rit_actor::ActorError;
 use rit_config::{ConfigError, RunDirError};
-use rit_env::{UnknownName, particle::UnfitScript};
+use rit_env::{TaskError, UnfitScript, UnknownName, rollout::LostEpisode};
 use rit_learner::{LearnerError, weights_file::WeightsFileError};
 use rit_proto::transport::{ConnectError, CredentialsError};
 use std::{fmt, process::ExitCode};
@@ -75,6 +75,18 @@ impl From<ConfigError> for Failure {
 impl From<RunDirError> for Failure {
     fn from(error: RunDirError) -> Self {
         Self::input(error)
+    }
+}
+
+impl From<TaskError> for Failure {
+    fn from(error: TaskError) -> Self {
+        Self::input(error)
+    }
+}
+
+impl From<LostEpisode> for Failure {
+    fn from(error: LostEpisode) -> Self {
+        Self::runtime(error)
     }
 }
 

@@ -3,7 +3,7 @@
 use crate::{cli::PlayOptions, experiments, failure::Failure};
 use rit_algo::{Acting, Model};
 use rit_config::{Config, RunDir};
-use rit_env::particle::Script;
+use rit_env::Script;
 use rit_episode::{Policy, RunSeed};
 use rit_learner::{
     checkpoint::{LATEST, WEIGHTS},

@@ -6,8 +6,7 @@ mod common;
 use common::RunFolder;
 use rit_config::RunDir;
 use rit_env::{
-    EnvironmentOptions, Split, TaskSet,
-    particle::Script,
+    EnvironmentOptions, Script, Split, TaskSet,
     rollout::{Job, Rollout},
 };
 use rit_episode::{
@@ -36,7 +35,7 @@ fn forged_frames_are_counted_and_never_reach_replay() {
     let tasks = TaskSet::MatrixGame.tasks(Split::Training);
     let mut rollout = Rollout::new(tasks, EnvironmentOptions::default(), RunSeed(9), true);
     let job = Job { number: 1_000_000, weights_version: 0, choice: Choice::EpsilonGreedy(1.0), task: None };
-    let episode = rollout.roll(&mut Script::Random, &[job]).remove(0);
+    let episode = rollout.roll(&mut Script::Random, &[job]).remove(0).unwrap();
     let mut frame = Frame::new(&layout);
     wire::encode(&episode, &layout, run_dir.run_id(), 0, &mut frame).unwrap();
     send(&frame);

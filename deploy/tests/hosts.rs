@@ -7,8 +7,7 @@ mod common;
 
 use common::{RunFolder, output, rit};
 use rit_env::{
-    Split, TaskSet,
-    particle::Script,
+    Script, Split, TaskSet,
     rollout::{Job, Rollout},
 };
 use rit_episode::{
@@ -377,7 +376,7 @@ async fn what_comes_twice_or_is_forged_is_counted_and_not_let_in() {
         choice: Choice::EpsilonGreedy(lease.epsilon),
         task: None,
     };
-    let episode = rollout.roll(&mut Script::Random, &[job]).remove(0);
+    let episode = rollout.roll(&mut Script::Random, &[job]).remove(0).unwrap();
     let run_id = welcome.run_id.try_into().unwrap();
     let frame = |run_id, actor| {
         let mut frame = Frame::new(&layout);

@@ -157,7 +157,9 @@ impl From<AskError> for Status {
             | AskError::Episodes(_)
             | AskError::Setting(_)
             | AskError::Log(_) => Self::invalid_argument(message),
-            AskError::Checkpoint(_) | AskError::Rollout(_) | AskError::RunDir(_) => Self::internal(message),
+            AskError::Checkpoint(_) | AskError::Rollout(_) | AskError::RunDir(_) | AskError::Lost(_) => {
+                Self::internal(message)
+            }
         }
     }
 }

@@ -2,8 +2,8 @@
 
 use rit_config::Config;
 use rit_env::{
-    Environment, EnvironmentOptions, Split, Task, TaskSet, UnknownName,
-    rollout::{Job, Rollout},
+    Environment, EnvironmentOptions, Split, Task, TaskError, TaskSet,
+    rollout::{Job, LostEpisode, Rollout, all_rolled},
 };
 use rit_episode::{Choice, Episode, Policy, RunSeed};
 use rit_proto::v1;
@@ -68,9 +68,11 @@ pub fn in_words(results: &[TaskResult]) -> String {
 }
 
 /// What all evaluations of a run share.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub struct Evaluator {
     task_set: TaskSet,
+    /// Training tasks and testing tasks.
+    tasks: [Vec<Task>; 2],
     options: EnvironmentOptions,
     random_permutation: bool,
 }
@@ -80,6 +82,7 @@ impl Evaluator {
     pub fn new(config: &Config) -> Self {
         Self {
             task_set: config.environment.task_set,
+            tasks: [Split::Training, Split::Testing].map(|split| config.tasks(split)),
             options: config.environment_options(),
             random_permutation: config.algorithm.random_permutation,
         }
@@ -89,15 +92,16 @@ impl Evaluator {
     ///
     /// # Errors
     /// When a name means nothing.
-    pub fn tasks(&self, names: &[String]) -> Result<Vec<Task>, UnknownName> {
+    pub fn tasks(&self, names: &[String]) -> Result<Vec<Task>, TaskError> {
+        let [training, testing] = &self.tasks;
         if names.is_empty() {
-            return Ok(self.task_set.tasks(Split::Training));
+            return Ok(training.clone());
         }
         let mut tasks = Vec::new();
         for name in names {
             match name.as_str() {
-                "training" => tasks.extend(self.task_set.tasks(Split::Training)),
-                "testing" => tasks.extend(self.task_set.tasks(Split::Testing)),
+                "training" => tasks.extend(training),
+                "testing" => tasks.extend(testing),
                 name => tasks.push(self.task_set.task(name)?),
             }
         }
@@ -105,18 +109,24 @@ impl Evaluator {
     }
 
     /// Rolls so many greedy episodes of each task. The same seed rolls the same episodes.
+    ///
+    /// # Errors
+    /// When an environment cannot go on.
     pub fn evaluate(
         &self,
         policy: &mut dyn Policy,
         tasks: &[Task],
         episodes: usize,
         seed: RunSeed,
-    ) -> Vec<TaskResult> {
+    ) -> Result<Vec<TaskResult>, LostEpisode> {
         tasks.iter().map(|&task| self.evaluate_task(policy, task, episodes, seed)).collect()
     }
 
     /// Rolls those episodes of these numbers that [`Self::evaluate`] rolls of a task with this seed, and shows
     /// their worlds to `watch`; see [`Rollout::roll_watched`].
+    ///
+    /// # Errors
+    /// When an environment cannot go on.
     pub fn watch(
         &self,
         policy: &mut dyn Policy,
@@ -124,8 +134,8 @@ impl Evaluator {
         numbers: Range<u64>,
         seed: RunSeed,
         watch: impl FnMut(usize, &dyn Environment),
-    ) -> Vec<Episode> {
-        self.rollout(task, seed).roll_watched(policy, &jobs(numbers), watch)
+    ) -> Result<Vec<Episode>, LostEpisode> {
+        all_rolled(self.rollout(task, seed).roll_watched(policy, &jobs(numbers), watch))
     }
 
     fn rollout(&self, task: Task, seed: RunSeed) -> Rollout {
@@ -139,23 +149,23 @@ impl Evaluator {
         task: Task,
         episodes: usize,
         seed: RunSeed,
-    ) -> TaskResult {
+    ) -> Result<TaskResult, LostEpisode> {
         let mut rollout = self.rollout(task, seed);
         let (mut total, mut won) = (0.0, 0);
         for jobs in jobs(0..episodes as u64).chunks(SIDE_BY_SIDE) {
-            for episode in rollout.roll(policy, jobs) {
+            for episode in all_rolled(rollout.roll(policy, jobs))? {
                 total += episode.total_reward();
                 won += usize::from(episode.won);
             }
         }
         let share = |sum: f64| sum / episodes as f64;
-        TaskResult {
+        Ok(TaskResult {
             task: task.to_string(),
             episodes: episodes as u64,
             mean_return: share(total),
-            win_rate: self.task_set.has_wins().then(|| share(won as f64)),
+            win_rate: task.spec().has_wins.then(|| share(won as f64)),
             exploring: None,
-        }
+        })
     }
 }
 
@@ -168,7 +178,7 @@ fn jobs(numbers: Range<u64>) -> Vec<Job> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use rit_env::particle::Script;
+    use rit_env::Script;
     use rit_episode::Turn;
 
     /// Plays what wins game 4 of the matrix games, in any order.
@@ -187,7 +197,7 @@ mod tests {
         let config = rit_config::resolve("environment.task_set = \"matrix-game\"", "test", &[]).unwrap();
         let evaluator = Evaluator::new(&config);
         let tasks = evaluator.tasks(&["game-4".into(), "game-2".into()]).unwrap();
-        let results = evaluator.evaluate(&mut FirstAction, &tasks, 70, RunSeed(1));
+        let results = evaluator.evaluate(&mut FirstAction, &tasks, 70, RunSeed(1)).unwrap();
         let facts: Vec<_> =
             results.iter().map(|r| (r.task.as_str(), r.episodes, r.mean_return, r.win_rate)).collect();
         assert_eq!(facts, [("game-4", 70, 106.0, Some(1.0)), ("game-2", 70, -18.0, Some(0.0))]);
@@ -203,12 +213,13 @@ mod tests {
         let evaluator = Evaluator::new(&config);
         let task = evaluator.tasks(&["predator-prey-3-2".into()]).unwrap()[0];
         let mut states = [0; 4];
-        let watched =
-            evaluator.watch(&mut Script::Chase, task, 0..4, RunSeed(1), |episode, _| states[episode] += 1);
-        let measured = evaluator.evaluate(&mut Script::Chase, &[task], 4, RunSeed(1));
+        let watched = evaluator
+            .watch(&mut Script::Chase, task, 0..4, RunSeed(1), |episode, _| states[episode] += 1)
+            .unwrap();
+        let measured = evaluator.evaluate(&mut Script::Chase, &[task], 4, RunSeed(1)).unwrap();
         let mean = watched.iter().map(Episode::total_reward).sum::<f64>() / 4.0;
         assert_eq!((mean, states), (measured[0].mean_return, [26; 4]));
-        let last = evaluator.watch(&mut Script::Chase, task, 3..4, RunSeed(1), |_, _| {});
+        let last = evaluator.watch(&mut Script::Chase, task, 3..4, RunSeed(1), |_, _| {}).unwrap();
         assert_eq!(last, watched[3..], "its number makes an episode what it is");
     }
 }

@@ -269,9 +269,8 @@ fn files(folder: &Path) -> io::Result<Vec<u64>> {
 mod tests {
     use super::*;
     use rit_env::{
-        EnvironmentOptions, Split, TaskSet,
-        particle::Script,
-        rollout::{Job, Rollout},
+        EnvironmentOptions, Script, Split, TaskSet,
+        rollout::{Job, Rollout, all_rolled},
     };
     use rit_episode::{Choice, RunSeed};
 
@@ -292,7 +291,7 @@ mod tests {
         let jobs: Vec<Job> = numbers
             .map(|number| Job { number, weights_version: 7, choice: Choice::EpsilonGreedy(1.0), task: None })
             .collect();
-        rollout.roll(&mut Script::Random, &jobs)
+        all_rolled(rollout.roll(&mut Script::Random, &jobs)).unwrap()
     }
 
     fn log(folder: &Path, next: u64) -> ReplayLog {

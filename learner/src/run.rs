@@ -248,11 +248,10 @@ pub async fn run(
 
 /// What every episode of this run must look like.
 pub fn expected(run_dir: &RunDir, config: &Config) -> Expected {
-    let task_set = config.environment.task_set;
     Expected {
         run_id: run_dir.run_id(),
-        layout: PayloadLayout::new(task_set.dims()),
-        tasks: task_set.tasks(Split::Training).into_iter().map(rit_env::Task::size).collect(),
+        layout: PayloadLayout::new(config.dims()),
+        tasks: config.tasks(Split::Training).into_iter().map(rit_env::Task::size).collect(),
     }
 }
 

@@ -8,7 +8,7 @@ use crate::{
 };
 use rit_algo::{Acting, Model};
 use rit_config::{Config, ConfigError, RunDir, RunDirError, set, set_live};
-use rit_env::{Scene, TaskSet, UnknownName};
+use rit_env::{Scene, TaskError, TaskSet, rollout::LostEpisode};
 use rit_episode::{Episode, RunSeed};
 use rit_proto::v1;
 use std::sync::Arc;
@@ -31,7 +31,10 @@ pub enum AskError {
     Over,
     /// No such task.
     #[error(transparent)]
-    Task(#[from] UnknownName),
+    Task(#[from] TaskError),
+    /// An environment could not go on.
+    #[error(transparent)]
+    Lost(#[from] LostEpisode),
     /// A split without tasks.
     #[error("{0} has no such tasks")]
     NoTasks(TaskSet),
@@ -176,14 +179,14 @@ impl RunHandle {
         };
         let seed = seed.map_or_else(|| evaluation_seed(&config), RunSeed);
         self.roll(move |acting, snapshot| {
-            let results = evaluator.evaluate(acting, &tasks, episodes, seed);
-            v1::Evaluation {
+            let results = evaluator.evaluate(acting, &tasks, episodes, seed)?;
+            Ok(v1::Evaluation {
                 env_steps: snapshot.env_steps,
                 weights_version: snapshot.version,
                 tasks: results.iter().map(TaskResult::to_message).collect(),
-            }
+            })
         })
-        .await
+        .await?
     }
 
     /// The episode of this number of the run's own evaluation of a task, rolled with the newest weights.
@@ -198,11 +201,11 @@ impl RunHandle {
         self.roll(move |acting, snapshot| {
             let (mut scenes, one) = (Vec::new(), number..number + 1);
             let mut episodes =
-                evaluator.watch(acting, task, one, seed, |_, world| scenes.extend(world.scene()));
+                evaluator.watch(acting, task, one, seed, |_, world| scenes.extend(world.scene()))?;
             // One number, one episode.
-            Watched { snapshot: Arc::clone(snapshot), episode: episodes.swap_remove(0), scenes }
+            Ok(Watched { snapshot: Arc::clone(snapshot), episode: episodes.swap_remove(0), scenes })
         })
-        .await
+        .await?
     }
 
     /// Rolls with the newest weights on a thread of its own. Whoever asked may go: the next one's turn comes

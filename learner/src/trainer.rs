@@ -18,7 +18,7 @@ use rit_algo::{
     learner::{Draw, NamedState, NotFinite, StateError},
 };
 use rit_config::{Config, RunDir, Until};
-use rit_env::Split;
+use rit_env::{Split, rollout::LostEpisode};
 use rit_episode::{Episode, RunSeed, Stream};
 use serde::Serialize;
 use std::{
@@ -108,6 +108,9 @@ pub enum TrainError {
         /// Why.
         error: io::Error,
     },
+    /// An environment of an evaluation could not go on.
+    #[error("the evaluation failed: {0}; `rit train --resume` goes on from the newest checkpoint")]
+    Evaluation(#[from] LostEpisode),
     /// A checkpoint that is not this learner's.
     #[error("the checkpoint cannot be gone on from: {0}")]
     State(#[from] StateError),
@@ -182,7 +185,7 @@ impl Trainer {
         let first = Snapshot::new(0, 0, acting_params(&*learner));
         let first_terms = Terms { weights_version: 0, epsilon: config.epsilon(0) };
         let task_set = config.environment.task_set;
-        let tasks = task_set.tasks(Split::Training).iter().map(ToString::to_string).collect();
+        let tasks = config.tasks(Split::Training).iter().map(ToString::to_string).collect();
         let (metrics, tensorboard) = files(&run_dir, loaded.as_ref().map(|loaded| &loaded.state.manifest))?;
         let mut trainer = Self {
             replay: (learner.regime() == Regime::Replay).then(|| Replay::new(config.algorithm.buffer_size)),
@@ -363,7 +366,7 @@ impl Trainer {
     /// differ by the weights alone.
     fn evaluate(&mut self) -> Result<(), TrainError> {
         let progress = self.standing.progress;
-        let results = self.greedy(self.config.evaluation.episodes);
+        let results = self.greedy(self.config.evaluation.episodes)?;
         let line = Line::Evaluation { progress, wall_s: self.metrics.wall_s(), tasks: by_task(&results) };
         self.measured(&line)?;
         tracing::info!(env_steps = progress.env_steps, results = %in_words(&results), "evaluated");
@@ -377,9 +380,9 @@ impl Trainer {
         Ok(())
     }
 
-    fn greedy(&self, episodes: usize) -> Vec<TaskResult> {
+    fn greedy(&self, episodes: usize) -> Result<Vec<TaskResult>, LostEpisode> {
         let mut acting = Acting::new(self.learner.model(), acting_params(&*self.learner));
-        let tasks = self.config.environment.task_set.tasks(Split::Training);
+        let tasks = self.config.tasks(Split::Training);
         self.evaluator.evaluate(&mut acting, &tasks, episodes, evaluation_seed(&self.config))
     }
 
@@ -445,7 +448,7 @@ impl Trainer {
     fn finish(mut self) -> Result<Summary, TrainError> {
         let (done, written) = oneshot::channel();
         let weights_digest = self.checkpoint(Some(done));
-        let results = self.greedy(self.config.evaluation.episodes);
+        let results = self.greedy(self.config.evaluation.episodes)?;
         let written =
             written.blocking_recv().map_err(|_| TrainError::Checkpoint("the writer has gone".into()))?;
         written.map_err(|error| TrainError::Checkpoint(error.to_string()))?;

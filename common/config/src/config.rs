@@ -2,8 +2,11 @@
 
 use crate::ConfigError;
 use rit_algo::{Method, ModelConfig, PpoConfig, Regime, TerminalStates, UpdateConfig, method::Encoder};
-use rit_env::{EnvironmentOptions, TaskSet};
-use rit_episode::RunSeed;
+use rit_env::{
+    EnvironmentOptions, Split, Task, TaskSet,
+    combat::{CombatOptions, StatsVersion, world::ScriptedMedivac},
+};
+use rit_episode::{Dims, RunSeed};
 use rit_nn::OptimizerKind;
 use serde::{Deserialize, Serialize};
 use std::{collections::BTreeMap, net::SocketAddr};
@@ -31,8 +34,25 @@ pub struct Config {
 #[allow(missing_docs, reason = "presets/all.toml documents every key, for users too")]
 pub struct Environment {
     pub task_set: TaskSet,
+    pub training_tasks: Vec<String>,
+    pub testing_tasks: Vec<String>,
     pub view_radius: f32,
     pub approach_shaping: f32,
+    pub spawn_rotate: SpawnRotate,
+    pub stats: StatsVersion,
+    pub enemy_medivac: ScriptedMedivac,
+}
+
+/// Whether armies face each other at a random angle.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum SpawnRotate {
+    /// As the authors' code does it for the task set.
+    Published,
+    /// Always.
+    Always,
+    /// Never.
+    Never,
 }
 
 /// `[algorithm]`.
@@ -262,7 +282,7 @@ impl Config {
 
     /// The model's method and sizes.
     pub fn model(&self) -> ModelConfig {
-        let (dims, network) = (self.environment.task_set.dims(), &self.network);
+        let (dims, network) = (self.dims(), &self.network);
         let method = match (self.algorithm.mixing, self.algorithm.task_representations) {
             (MixingKind::Network, true) => Method::Rit,
             (MixingKind::Sum, true) => Method::RitVdn,
@@ -309,10 +329,40 @@ impl Config {
         }
     }
 
+    /// The tasks of one split: the configuration's own list, or else the task set's. A task's index is its place among
+    /// the training tasks.
+    pub fn tasks(&self, split: Split) -> Vec<Task> {
+        let Environment { task_set, training_tasks, testing_tasks, .. } = &self.environment;
+        let names = match split {
+            Split::Training => training_tasks,
+            Split::Testing => testing_tasks,
+        };
+        if names.is_empty() {
+            return task_set.tasks(split);
+        }
+        // `resolve` has refused names that are none.
+        names.iter().filter_map(|name| task_set.task(name).ok()).collect()
+    }
+
+    /// The padded sizes over all tasks, testing tasks included (paper, appendix A).
+    pub fn dims(&self) -> Dims {
+        TaskSet::dims_of([Split::Training, Split::Testing].into_iter().flat_map(|split| self.tasks(split)))
+    }
+
     /// How the environments differ from what their task says.
     pub fn environment_options(&self) -> EnvironmentOptions {
-        let Environment { view_radius, approach_shaping, .. } = self.environment;
-        EnvironmentOptions { view_radius: view_radius.is_finite().then_some(view_radius), approach_shaping }
+        let Environment { view_radius, approach_shaping, spawn_rotate, stats, enemy_medivac, .. } =
+            self.environment;
+        let spawn_rotate = match spawn_rotate {
+            SpawnRotate::Published => None,
+            SpawnRotate::Always => Some(true),
+            SpawnRotate::Never => Some(false),
+        };
+        EnvironmentOptions {
+            view_radius: view_radius.is_finite().then_some(view_radius),
+            approach_shaping,
+            combat: CombatOptions { spawn_rotate, stats, enemy_medivac, mirror: false },
+        }
     }
 
     /// Episodes that replay holds; 0 where the method learns from each batch once.

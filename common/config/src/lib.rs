@@ -11,7 +11,7 @@ mod run_dir;
 
 pub use config::{
     Actors, Algorithm, Checkpoints, Config, Environment, Evaluation, Learner, MixingKind, Network,
-    OptimizerName, Tls, Training, Until, Web, WebListen,
+    OptimizerName, SpawnRotate, Tls, Training, Until, Web, WebListen,
 };
 pub use regular_file::{TEXT_BYTES_MAX, read_regular, read_text};
 pub use resolve::{ConfigError, is_live, resolve, set, set_live};

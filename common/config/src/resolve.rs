@@ -1,7 +1,10 @@
 //! From what a person typed to a [`Config`].
 
-use crate::Config;
-use rit_env::{TaskSet, UnknownName};
+use crate::{Config, Environment, SpawnRotate};
+use rit_env::{
+    TaskError, TaskSet, UnknownName,
+    combat::{StatsVersion, world::ScriptedMedivac},
+};
 use std::collections::BTreeMap;
 use toml::{Table, Value};
 
@@ -54,6 +57,22 @@ pub enum ConfigError {
         /// The task set.
         task_set: TaskSet,
     },
+    /// A name that is no task of the set.
+    #[error("{key}: {error}")]
+    Task {
+        /// The key.
+        key: &'static str,
+        /// What is wrong with the name.
+        error: TaskError,
+    },
+    /// A task that is listed twice.
+    #[error("{key} lists {name} twice")]
+    TaskTwice {
+        /// The key.
+        key: &'static str,
+        /// The task.
+        name: String,
+    },
     /// A word that means nothing there.
     #[error("{0}")]
     Name(#[from] UnknownName),
@@ -105,6 +124,7 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
         TaskSet::CooperativeNavigation | TaskSet::PredatorPrey | TaskSet::PredatorPreyPro => {
             include_str!("presets/mpe.toml")
         }
+        TaskSet::Combat(_) => include_str!("presets/smac.toml"),
     };
     let mut all = defaults;
     merge(&mut all, parse(preset, "the task set's preset")?);
@@ -118,9 +138,28 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
         }
     }
     let task_set = config.environment.task_set;
+    let Environment { training_tasks, testing_tasks, spawn_rotate, stats, enemy_medivac, .. } =
+        &config.environment;
+    for (key, names) in
+        [("environment.training_tasks", training_tasks), ("environment.testing_tasks", testing_tasks)]
+    {
+        for (at, name) in names.iter().enumerate() {
+            task_set.task(name).map_err(|error| ConfigError::Task { key, error })?;
+            if names[..at].contains(name) {
+                return Err(ConfigError::TaskTwice { key, name: name.clone() });
+            }
+        }
+    }
+    let is_combat = matches!(task_set, TaskSet::Combat(_));
     let meaningless = [
+        ("environment.spawn_rotate", *spawn_rotate != SpawnRotate::Published && !is_combat),
+        ("environment.stats", *stats != StatsVersion::default() && !is_combat),
+        ("environment.enemy_medivac", *enemy_medivac != ScriptedMedivac::default() && !is_combat),
         ("environment.approach_shaping", config.environment.approach_shaping != 0.0 && !task_set.has_prey()),
-        ("environment.view_radius", config.environment.view_radius.is_finite() && !task_set.has_places()),
+        (
+            "environment.view_radius",
+            config.environment.view_radius.is_finite() && !task_set.has_view_radius(),
+        ),
     ];
     if let Some(&(key, _)) = meaningless.iter().find(|(_, meaningless)| *meaningless) {
         return Err(ConfigError::Meaningless { key, task_set });

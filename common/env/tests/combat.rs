@@ -39,7 +39,12 @@ fn battle(
 ) -> (f32, bool) {
     let spec = combat.spec();
     let rng = &mut SEED.stream(Stream::Environment, number);
-    let mut exploration = Exploration::new(0.0, 0.0, spec.n_agents, SEED.stream(Stream::Exploration, number));
+    let mut exploration = Exploration::new(
+        rit_episode::Choice::Greedy,
+        0.0,
+        spec.n_agents,
+        SEED.stream(Stream::Exploration, number),
+    );
     combat.reset(rng).unwrap();
     look(combat);
     let mut actions: Vec<Action> = vec![0; spec.n_agents];

@@ -29,7 +29,7 @@ pub(super) struct Cost {
 
 pub(super) fn run(measured: &Measured, duration: Duration) -> Result<Report, Failure> {
     let config = &measured.config;
-    let tasks = config.environment.task_set.tasks(Split::Training);
+    let tasks = config.tasks(Split::Training);
     let limit_before = large_product_flops();
     let cost = measure(measured, &tasks, config.algorithm.buffer_size, duration)?;
     // A shared machine's speed drifts: the limit is measured before and after.

@@ -18,8 +18,7 @@ use crate::{
 use rit_algo::Model;
 use rit_config::Config;
 use rit_env::{
-    Task,
-    particle::Script,
+    Script, Task,
     rollout::{Job, Rollout},
 };
 use rit_episode::{Choice, Episode, RunSeed, Stream};
@@ -35,7 +34,7 @@ pub fn run(options: &BenchOptions) -> Result<ExitCode, Failure> {
     let mut report = match options.kind {
         BenchKind::Learner => learner::run(&measured, duration)?,
         BenchKind::Rollout => rollout::run(&measured, duration)?,
-        BenchKind::Env => env::run(&measured.config, duration),
+        BenchKind::Env => env::run(&measured.config, duration)?,
         BenchKind::Ipc => ipc::run(options.payload_kib, duration)?,
         BenchKind::Scale => scale::run(&measured, &options.experiment, &options.settings, duration)?,
     };
@@ -135,5 +134,5 @@ fn random_episodes(config: &Config, tasks: &[Task], count: u64) -> Vec<Episode> 
     let jobs: Vec<Job> = (0..count)
         .map(|number| Job { number, weights_version: 0, choice: Choice::EpsilonGreedy(1.0), task: None })
         .collect();
-    jobs.chunks(64).flat_map(|jobs| rollout.roll(&mut Script::Random, jobs)).collect()
+    jobs.chunks(64).flat_map(|jobs| rollout.roll(&mut Script::Random, jobs)).flatten().collect()
 }

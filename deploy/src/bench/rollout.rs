@@ -20,8 +20,7 @@ pub(super) struct Cost {
 
 pub(super) fn run(measured: &Measured, duration: Duration) -> Result<Report, Failure> {
     let config = &measured.config;
-    let Cost { env_steps, cpu_s, flops } =
-        measure(measured, config.environment.task_set.tasks(Split::Training), duration);
+    let Cost { env_steps, cpu_s, flops } = measure(measured, config.tasks(Split::Training), duration);
     let mut report = Report::new();
     report.insert("env_steps_per_cpu_s".into(), (env_steps as f64 / cpu_s).into());
     report.insert("gemm_gflop_per_cpu_s".into(), (flops as f64 / cpu_s * 1e-9).into());
@@ -51,7 +50,7 @@ pub(super) fn measure(
             .map(|number| Job { number, weights_version: 0, choice, task: None })
             .collect();
         number += side_by_side;
-        rollout.roll(acting, &jobs).iter().map(|episode| episode.steps() as u64).sum()
+        rollout.roll(acting, &jobs).iter().flatten().map(|episode| episode.steps() as u64).sum()
     };
     roll(&mut acting);
     let (cpu, wall, flops) = (cpu_s(), Instant::now(), matmul::flops());

@@ -86,7 +86,7 @@ fn record(options: &RenderOptions) -> Result<Film, Failure> {
     let (evaluator, numbers) = (Evaluator::new(&player.config), 0..count as u64);
     let episodes = evaluator.watch(player.policy.as_mut(), task, numbers, seed, |episode, world| {
         scenes[episode].extend(world.scene());
-    });
+    })?;
     if scenes.iter().any(Vec::is_empty) {
         return Err(Failure::input_message(format!(
             "{task} is played on a table of rewards, where nothing has a place: there is nothing to draw; \

@@ -18,8 +18,7 @@ impl Coordinator {
         let of = |name| measured.get(name).unwrap_or_default();
         let messages = |results: &[TaskResult]| results.iter().map(TaskResult::to_message).collect();
         // All frames of a run have the same length.
-        let frame_bytes =
-            size_of::<Header>() + PayloadLayout::new(self.config.environment.task_set.dims()).len();
+        let frame_bytes = size_of::<Header>() + PayloadLayout::new(self.config.dims()).len();
         v1::RunStatus {
             state: self.state.into(),
             env_steps: progress.env_steps,

@@ -80,9 +80,10 @@ impl IntoResponse for ApiError {
                 | AskError::Setting(_)
                 | AskError::Log(_),
             ) => StatusCode::BAD_REQUEST,
-            Self::Ask(AskError::Checkpoint(_) | AskError::Rollout(_) | AskError::RunDir(_)) | Self::Io(_) => {
-                StatusCode::INTERNAL_SERVER_ERROR
-            }
+            Self::Ask(
+                AskError::Checkpoint(_) | AskError::Rollout(_) | AskError::RunDir(_) | AskError::Lost(_),
+            )
+            | Self::Io(_) => StatusCode::INTERNAL_SERVER_ERROR,
         };
         (status, Json(serde_json::json!({ "error": self.to_string() }))).into_response()
     }
@@ -107,8 +108,7 @@ struct Run {
 async fn run(State(page): State<Page>) -> Result<Json<Run>, ApiError> {
     let (config, root) = (page.handle.config(), page.run_dir.root());
     let task_set = config.environment.task_set;
-    let names = |split| task_set.tasks(split).iter().map(Task::to_string).collect();
-    let scene = |task: &Task| task.environment(config.environment_options()).scene();
+    let names = |split| config.tasks(split).iter().map(Task::to_string).collect();
     Ok(Json(Run {
         name: root.file_name().unwrap_or_default().to_string_lossy().into_owned(),
         directory: root.display().to_string(),
@@ -117,7 +117,7 @@ async fn run(State(page): State<Page>) -> Result<Json<Run>, ApiError> {
         training_tasks: names(Split::Training),
         testing_tasks: names(Split::Testing),
         has_wins: task_set.has_wins(),
-        has_scenes: task_set.tasks(Split::Training).iter().all(|task| scene(task).is_some()),
+        has_scenes: config.tasks(Split::Training).iter().all(|task| task.spec().has_scenes),
         evaluation_episodes: config.evaluation.episodes,
         config: fs::read_to_string(page.run_dir.config_path())?,
     }))

@@ -25,7 +25,7 @@ pub fn check(input: &[u8]) -> bool {
     let epsilon = config.epsilon(config.training.t_max / 2);
     assert!((0.0..=1.0).contains(&epsilon), "epsilon {epsilon}");
     assert!(rit_algo::Model::new(config.model()).is_ok());
-    for task in config.environment.task_set.tasks(rit_env::Split::Training) {
+    for task in config.tasks(rit_env::Split::Training) {
         task.environment(config.environment_options());
     }
     let written = toml::to_string(&config).map_err(|error| error.to_string());

@@ -2,9 +2,8 @@
 
 use bytemuck::Zeroable as _;
 use rit_env::{
-    EnvironmentOptions, Split, TaskSet,
-    particle::Script,
-    rollout::{Job, Rollout},
+    EnvironmentOptions, Script, Split, TaskSet,
+    rollout::{Job, Rollout, all_rolled},
 };
 use rit_episode::{
     Choice, Dims, Episode, RunSeed,
@@ -90,7 +89,7 @@ pub(crate) fn matrix_episodes(count: u64) -> Vec<Episode> {
     let jobs: Vec<Job> = (0..count)
         .map(|number| Job { number, weights_version: 0, choice: Choice::EpsilonGreedy(1.0), task: None })
         .collect();
-    rollout.roll(&mut Script::Random, &jobs)
+    all_rolled(rollout.roll(&mut Script::Random, &jobs)).unwrap()
 }
 
 fn padded_episode(task: usize, TaskSize { n_agents, n_entities }: TaskSize) -> Episode {

@@ -177,7 +177,7 @@ fn predators_and_prey_are_as_fast_as_they_should_be() {
     let mut rng = stream(0);
     let speeds: Vec<[f32; 2]> = (0..20)
         .map(|_| {
-            environment.step(&[2], &mut rng).unwrap().unwrap();
+            environment.step(&[2], &mut rng).unwrap();
             [environment.predators()[0].velocity, environment.prey()[0].velocity].map(|v| v[0].hypot(v[1]))
         })
         .collect();

@@ -5,7 +5,7 @@ use crate::{
     rollout::{Job, Rollout, all_rolled},
 };
 use rand::RngExt as _;
-use rit_episode::{Choice, Exploration, RunSeed, Stream};
+use rit_episode::{Choice, Exploration, Policy as _, RunSeed, Stream};
 
 /// Mean total reward of a script over testing tasks, mixed evenly, and its standard error.
 fn mean_reward(set: TaskSet, mut script: Script, episodes: usize) -> (f64, f64) {
