@@ -1,5 +1,7 @@
 //! Whole battles: what every environment promises, what every battle keeps, and how scripts fare.
 
+#![allow(clippy::panic, clippy::unwrap_used, clippy::expect_used, clippy::print_stdout, reason = "test code")]
+
 use rit_env::{
     Environment,
     combat::{Combat, CombatOptions, CombatScript, CombatSet, Team, world::Side},

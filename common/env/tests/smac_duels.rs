@@ -1,6 +1,8 @@
 //! The simulator against an independent reference: duels with orders by tick, their deaths, first hits and states.
 //! `RIT_SMAC_DIR` names a folder with another `duels.json`.
 
+#![allow(clippy::panic, clippy::unwrap_used, clippy::expect_used, clippy::print_stdout, reason = "test code")]
+
 mod common;
 
 use common::{index, list, number, read, text};

@@ -1,6 +1,8 @@
 //! The translation against the published environment: snapshots of units in, and what its class made of them.
 //! `RIT_SMAC_DIR` names a folder with other cases under `golden/`.
 
+#![allow(clippy::panic, clippy::unwrap_used, clippy::expect_used, clippy::print_stdout, reason = "test code")]
+
 mod common;
 
 use common::{folder, index, list, number, read, text};

@@ -4,6 +4,7 @@ use serde_json::Value;
 use std::{env, fs, path::PathBuf};
 
 /// The folder named by `RIT_SMAC_DIR`, or the repository's copy.
+#[allow(dead_code, reason = "not every test uses all")]
 pub fn folder() -> PathBuf {
     env::var_os("RIT_SMAC_DIR")
         .map_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/smac"), PathBuf::from)

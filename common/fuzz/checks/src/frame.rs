@@ -3,7 +3,7 @@
 use bytemuck::Zeroable as _;
 use rit_env::{
     EnvironmentOptions, Script, Split, TaskSet,
-    rollout::{Job, Rollout, all_rolled},
+    rollout::{Job, Rollout},
 };
 use rit_episode::{
     Choice, Dims, Episode, RunSeed,
@@ -89,7 +89,7 @@ pub(crate) fn matrix_episodes(count: u64) -> Vec<Episode> {
     let jobs: Vec<Job> = (0..count)
         .map(|number| Job { number, weights_version: 0, choice: Choice::EpsilonGreedy(1.0), task: None })
         .collect();
-    all_rolled(rollout.roll(&mut Script::Random, &jobs)).unwrap()
+    rollout.roll(&mut Script::Random, &jobs).into_iter().flatten().collect()
 }
 
 fn padded_episode(task: usize, TaskSize { n_agents, n_entities }: TaskSize) -> Episode {

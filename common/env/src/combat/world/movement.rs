@@ -42,9 +42,8 @@ impl World {
         self.goals.clear();
         self.goals.extend_from_slice(&self.positions);
         // Distances to be gone, in the same place as the goals they are gone towards.
-        let mut steps = std::mem::take(&mut self.steps);
-        steps.clear();
-        steps.resize(count, 0.0);
+        self.steps.clear();
+        self.steps.resize(count, 0.0);
         for unit in 0..count {
             let Some(intent) = self.intent(unit) else {
                 self.speeds[unit] = 0.0;
@@ -54,19 +53,17 @@ impl World {
             self.speeds[unit] = intent.speed_max.min(self.speeds[unit] + acceleration);
             self.moving[unit] = true;
             self.goals[unit] = intent.goal;
-            steps[unit] = (self.speeds[unit] / TICKS_PER_SECOND).min(intent.distance_max);
+            self.steps[unit] = (self.speeds[unit] / TICKS_PER_SECOND).min(intent.distance_max);
         }
         if self.moving.contains(&true) {
             for unit in 0..count {
                 // Positions stay those of the tick's start until every way is known.
-                self.goals[unit] =
-                    if self.moving[unit] { self.way(unit, steps[unit]) } else { self.positions[unit] };
+                self.goals[unit] = if self.moving[unit] { self.way(unit) } else { self.positions[unit] };
             }
             std::mem::swap(&mut self.positions, &mut self.goals);
         }
         self.push_bodies();
         self.keep_inside();
-        self.steps = steps;
     }
 
     fn intent(&self, unit: usize) -> Option<Intent> {
@@ -98,7 +95,8 @@ impl World {
 
     /// Where a unit gets to that goes so far towards its goal, round what stands in its way. It passes all bodies on
     /// the side on which it passes the first, and remembers that side until its way is free.
-    fn way(&mut self, unit: usize, step: f64) -> Point {
+    fn way(&mut self, unit: usize) -> Point {
+        let step = self.steps[unit];
         let (from, goal) = (self.positions[unit], self.goals[unit]);
         let length = distance(from, goal);
         let mut direction = [(goal[0] - from[0]) / length, (goal[1] - from[1]) / length];
