@@ -127,7 +127,7 @@ fn the_simulator_favours_nobody() {
         let mut combat = Combat::new(set, teams(set, name), options);
         let (mut won, mut lost) = (0.0, 0.0);
         for number in 0..1000 {
-            let (_, wins) = battle(&mut combat, number, |turn| still(turn), |_| {});
+            let (_, wins) = battle(&mut combat, number, still, |_| {});
             let world = combat.world();
             let allies_live =
                 (0..world.len()).any(|unit| world.is_alive(unit) && world.side(unit) == Side::Ally);
