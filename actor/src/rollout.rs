@@ -95,6 +95,7 @@ impl Roller {
         let algorithm = &config.algorithm;
         Rollout::new(tasks, options, config.seed, algorithm.random_permutation)
             .with_exploration_persistence(algorithm.exploration_persistence)
+            .with_time_limit_bootstraps(algorithm.time_limit_bootstraps)
     }
 
     /// Rolls leases until there are no more; says which are `done`.

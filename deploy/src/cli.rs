@@ -40,7 +40,7 @@ pub enum Command {
     Plot(PlotOptions),
     /// Make an authority, and certificates for a learner and for those who call it over TCP
     Certificates(CertificatesOptions),
-    /// List the experiments that come with the program
+    /// List the task sets' experiments and the algorithms that come with the program
     Experiments,
     /// Print completions for a shell, such as `rit completions bash > /etc/bash_completion.d/rit`
     Completions {
@@ -59,6 +59,9 @@ pub struct ConfigOptions {
     /// set anew, such as --steps or --actors
     #[arg(long, value_name = "DIR", conflicts_with_all = ["run_dir", "seed"])]
     pub resume: Option<PathBuf>,
+    /// The algorithm, in place of the experiment's; `rit experiments` lists them
+    #[arg(long, value_name = "NAME")]
+    pub algorithm: Option<String>,
     /// The run's seed: the same seed gives the same weights
     #[arg(long, value_name = "N")]
     pub seed: Option<u64>,
@@ -97,6 +100,9 @@ pub struct LearnerOptions {
     /// Make the run directory first, for this experiment or TOML file
     #[arg(long, value_name = "EXPERIMENT")]
     pub new: Option<String>,
+    /// The algorithm of a new run, in place of the experiment's
+    #[arg(long, value_name = "NAME", requires = "new")]
+    pub algorithm: Option<String>,
     /// Set any key of a new run; may be given again and again
     #[arg(long = "set", value_name = "KEY=VALUE", requires = "new")]
     pub settings: Vec<String>,
@@ -235,6 +241,9 @@ pub struct SoakOptions {
     /// Name of an experiment or path of a TOML file
     #[arg(default_value = "matrix-game")]
     pub experiment: String,
+    /// The algorithm, in place of the experiment's
+    #[arg(long, value_name = "NAME")]
+    pub algorithm: Option<String>,
     /// Kills, spread over the run
     #[arg(long, default_value_t = 10, value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..=100_000))]
     pub kills: usize,
@@ -289,6 +298,9 @@ pub struct BenchOptions {
     /// Experiment whose sizes and tasks are used
     #[arg(long, default_value = "cooperative-navigation", conflicts_with = "run")]
     pub experiment: String,
+    /// The algorithm, in place of the experiment's; for the learner, `all` measures every one of them
+    #[arg(long, value_name = "NAME", conflicts_with = "run")]
+    pub algorithm: Option<String>,
     /// Run whose configuration and newest weights are used instead of fresh ones, for learner and rollout
     #[arg(long, value_name = "DIR")]
     pub run: Option<PathBuf>,

@@ -1,6 +1,7 @@
 //! The experiments that come with the program, and a person's own.
 
 use crate::{cli::ConfigOptions, failure::Failure};
+use rit_algo::Method;
 use rit_config::{Config, resolve, set};
 use std::{fs, path::Path, process::ExitCode};
 use toml::Table;
@@ -38,11 +39,17 @@ pub struct Experiment {
 /// The settings of `train`'s options, beside `--set`.
 pub fn settings(options: &ConfigOptions) -> Vec<String> {
     let mut settings = options.settings.clone();
+    settings.extend(algorithm(options.algorithm.as_deref()));
     settings.extend(options.seed.map(|seed| format!("seed={seed}")));
     settings.extend(options.actors.map(|count| format!("actors.count={count}")));
     settings.extend(options.steps.map(|steps| format!("training.t_max={steps}")));
     settings.extend(options.until.as_ref().map(|until| format!("training.until={until:?}")));
     settings
+}
+
+/// `--algorithm NAME` as a setting: above what the experiment says and `--set` alike.
+pub fn algorithm(name: Option<&str>) -> Option<String> {
+    name.map(|name| format!("algorithm.name={name:?}"))
 }
 
 /// Resolves an experiment, by name or by file, under these `section.key=value` settings.
@@ -90,8 +97,14 @@ fn unknown(experiment: &str) -> Failure {
     reason = "a command like the others, and its output"
 )]
 pub fn print() -> Result<ExitCode, Failure> {
+    println!("experiments: task sets with their settings, `rit train EXPERIMENT`");
     for (name, text) in EXPERIMENTS {
-        println!("{name:38} {}", text.lines().next().unwrap_or_default().trim_start_matches("# "));
+        println!("  {name:38} {}", text.lines().next().unwrap_or_default().trim_start_matches("# "));
+    }
+    println!("\nalgorithms: any of them on any task set, `rit train EXPERIMENT --algorithm NAME`");
+    for facts in Method::ALL.map(Method::facts) {
+        let not_yet = if facts.built { "" } else { " (not built yet)" };
+        println!("  {:38} {}{not_yet}", facts.name, facts.summary);
     }
     Ok(ExitCode::SUCCESS)
 }

@@ -16,7 +16,9 @@ use tracing::Instrument as _;
 pub async fn learner(options: LearnerOptions, logs: LogOptions) -> Result<ExitCode, Failure> {
     let (span, set_log) = logs.start("learner")?;
     if let Some(experiment) = &options.new {
-        let experiment = experiments::load(experiment, &options.settings)?;
+        let mut settings = options.settings.clone();
+        settings.extend(experiments::algorithm(options.algorithm.as_deref()));
+        let experiment = experiments::load(experiment, &settings)?;
         RunDir::create(&options.run_dir, &experiment.config)?;
     }
     let (run_dir, config) = RunDir::open(&options.run_dir)?;

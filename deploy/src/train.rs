@@ -52,6 +52,8 @@ fn prepare(options: &ConfigOptions) -> Result<(RunDir, Config, String), Failure>
         }
         (None, Some(experiment)) => {
             let Experiment { name, config } = experiments::load(experiment, &settings)?;
+            let name =
+                options.algorithm.as_ref().map_or(name.clone(), |algorithm| format!("{name}-{algorithm}"));
             refuse_no_actors(&config)?;
             let run_dir = match &options.run_dir {
                 Some(root) => RunDir::create(root, &config)?,

@@ -1,6 +1,9 @@
 //! The resolved configuration: complete, and within its limits. `presets/all.toml` says what each key means.
 
-use crate::ConfigError;
+use crate::{
+    ConfigError,
+    method_keys::{self, by_name},
+};
 use rit_algo::{Method, ModelConfig, PpoConfig, Regime, TerminalStates, UpdateConfig, method::Encoder};
 use rit_env::{
     EnvironmentOptions, Split, Task, TaskSet,
@@ -10,6 +13,7 @@ use rit_episode::{Dims, RunSeed};
 use rit_nn::OptimizerKind;
 use serde::{Deserialize, Serialize};
 use std::{collections::BTreeMap, net::SocketAddr};
+use toml::Table;
 
 /// Everything a run is made from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -60,8 +64,9 @@ pub enum SpawnRotate {
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs, reason = "presets/all.toml documents every key, for users too")]
 pub struct Algorithm {
-    pub mixing: MixingKind,
-    pub task_representations: bool,
+    #[serde(with = "by_name")]
+    pub name: Method,
+    pub encoder: EncoderName,
     pub random_permutation: bool,
     pub gamma: f32,
     pub optimizer: OptimizerName,
@@ -78,16 +83,30 @@ pub struct Algorithm {
     pub batch_size: usize,
     pub target_update_interval: u64,
     pub policy_lag: usize,
+    pub imagined_weight: f32,
+    pub role_entropy_weight: f32,
+    pub role_kl_weight: f32,
+    pub role_dissimilarity_weight: f32,
+    pub role_soft_constraint: f32,
+    pub epochs: usize,
+    pub minibatches: usize,
+    pub clip: f64,
+    pub gae_lambda: f64,
+    pub entropy_coef: f64,
+    pub value_coef: f64,
+    pub huber_delta: f64,
+    pub value_norm_beta: f64,
+    pub time_limit_bootstraps: bool,
 }
 
-/// How utilities become Q_total.
+/// Which encoder, where there is a choice.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum MixingKind {
-    /// The mixing network.
-    Network,
-    /// Their sum: RIT-VDN.
-    Sum,
+pub enum EncoderName {
+    /// An agent is one of the entities it attends to.
+    Within,
+    /// Its own features stand beside what it attends to.
+    Beside,
 }
 
 /// Which optimiser.
@@ -112,6 +131,11 @@ pub struct Network {
     pub reward_embed_dim: usize,
     pub mixing_embed_dim: usize,
     pub hypernet_embed_dim: usize,
+    pub feedforward_dim: usize,
+    pub role_dim: usize,
+    pub role_hidden_dim: usize,
+    pub role_variance_floor: f32,
+    pub n_blocks: usize,
 }
 
 /// `[training]`.
@@ -277,21 +301,27 @@ impl Config {
     /// # Errors
     /// When TOML cannot say it.
     pub fn to_toml(&self) -> Result<String, ConfigError> {
-        toml::to_string(self).map_err(|error| ConfigError::Value(error.to_string()))
+        toml::to_string(&self.to_table()?).map_err(|error| ConfigError::Value(error.to_string()))
+    }
+
+    /// Every key that the method has.
+    pub(crate) fn to_table(&self) -> Result<Table, ConfigError> {
+        let mut table = Table::try_from(self).map_err(|error| ConfigError::Value(error.to_string()))?;
+        method_keys::retain(&mut table, self.algorithm.name);
+        Ok(table)
     }
 
     /// The model's method and sizes.
     pub fn model(&self) -> ModelConfig {
         let (dims, network) = (self.dims(), &self.network);
-        let method = match (self.algorithm.mixing, self.algorithm.task_representations) {
-            (MixingKind::Network, true) => Method::Rit,
-            (MixingKind::Sum, true) => Method::RitVdn,
-            (MixingKind::Network, false) => Method::RitNoTaskRepresentations,
-            (MixingKind::Sum, false) => Method::VdnInt,
-        };
+        let method = self.algorithm.name;
+        let own = method.facts().encoder;
         ModelConfig {
             method,
-            encoder: Encoder::Beside,
+            encoder: match self.algorithm.encoder {
+                EncoderName::Beside if own == Encoder::Within => Encoder::Beside,
+                _ => own,
+            },
             entity_dim: dims.entity_dim,
             n_actions: dims.n_actions,
             agents_max: dims.agents_max,
@@ -299,7 +329,7 @@ impl Config {
             hidden_dim: network.hidden_dim,
             attention_dim: network.attention_dim,
             n_heads: network.n_heads,
-            n_blocks: 1,
+            n_blocks: network.n_blocks,
             task_representation_dim: network.task_representation_dim,
             reward_embed_dim: network.reward_embed_dim,
             mixing_embed_dim: network.mixing_embed_dim,
@@ -325,7 +355,16 @@ impl Config {
             shards: self.learner.shards,
             threads: self.learner.threads,
             terminal_states: TerminalStates::LeftOut,
-            ppo: PpoConfig::default(),
+            ppo: PpoConfig {
+                gae_lambda: algorithm.gae_lambda,
+                clip: algorithm.clip,
+                entropy_coef: algorithm.entropy_coef,
+                value_coef: algorithm.value_coef,
+                huber_delta: algorithm.huber_delta,
+                epochs: algorithm.epochs,
+                minibatches: algorithm.minibatches,
+                value_norm_beta: algorithm.value_norm_beta,
+            },
         }
     }
 
@@ -367,7 +406,7 @@ impl Config {
 
     /// Episodes that replay holds; 0 where the method learns from each batch once.
     pub fn replay_episodes(&self) -> usize {
-        match self.model().method.facts().regime {
+        match self.algorithm.name.facts().regime {
             Regime::Replay => self.algorithm.buffer_size,
             Regime::OnPolicy => 0,
         }
@@ -375,7 +414,7 @@ impl Config {
 
     /// ε after so many collected environment steps; 0 where the method samples its actions.
     pub fn epsilon(&self, env_steps: u64) -> f32 {
-        if self.model().method.facts().regime == Regime::OnPolicy {
+        if self.algorithm.name.facts().regime == Regime::OnPolicy {
             return 0.0;
         }
         let Algorithm { epsilon_start, epsilon_finish, epsilon_anneal_steps, .. } = self.algorithm;
@@ -407,6 +446,19 @@ impl Config {
             ("algorithm.batch_size", algorithm.batch_size as f64, 1.0, algorithm.buffer_size as f64),
             ("algorithm.target_update_interval", algorithm.target_update_interval as f64, 1.0, STEPS),
             ("algorithm.policy_lag", algorithm.policy_lag as f64, 0.0, 64.0),
+            ("algorithm.imagined_weight", algorithm.imagined_weight.into(), 0.0, 1.0),
+            ("algorithm.role_entropy_weight", algorithm.role_entropy_weight.into(), 0.0, 1e6),
+            ("algorithm.role_kl_weight", algorithm.role_kl_weight.into(), 0.0, 1e6),
+            ("algorithm.role_dissimilarity_weight", algorithm.role_dissimilarity_weight.into(), 0.0, 1e6),
+            ("algorithm.role_soft_constraint", algorithm.role_soft_constraint.into(), 0.0, 1e6),
+            ("algorithm.epochs", algorithm.epochs as f64, 1.0, 1000.0),
+            ("algorithm.minibatches", algorithm.minibatches as f64, 1.0, algorithm.n_rollout_threads as f64),
+            ("algorithm.clip", algorithm.clip, 1e-6, 1e6),
+            ("algorithm.gae_lambda", algorithm.gae_lambda, 0.0, 1.0),
+            ("algorithm.entropy_coef", algorithm.entropy_coef, 0.0, 1e6),
+            ("algorithm.value_coef", algorithm.value_coef, 0.0, 1e6),
+            ("algorithm.huber_delta", algorithm.huber_delta, 1e-6, 1e6),
+            ("algorithm.value_norm_beta", algorithm.value_norm_beta, 0.0, 1.0),
             ("network.hidden_dim", network.hidden_dim as f64, 1.0, SIZE),
             ("network.attention_dim", network.attention_dim as f64, 1.0, SIZE),
             ("network.n_heads", network.n_heads as f64, 1.0, 64.0),
@@ -414,6 +466,11 @@ impl Config {
             ("network.reward_embed_dim", network.reward_embed_dim as f64, 1.0, SIZE),
             ("network.mixing_embed_dim", network.mixing_embed_dim as f64, 1.0, SIZE),
             ("network.hypernet_embed_dim", network.hypernet_embed_dim as f64, 1.0, SIZE),
+            ("network.feedforward_dim", network.feedforward_dim as f64, 1.0, SIZE),
+            ("network.role_dim", network.role_dim as f64, 1.0, SIZE),
+            ("network.role_hidden_dim", network.role_hidden_dim as f64, 1.0, SIZE),
+            ("network.role_variance_floor", network.role_variance_floor.into(), 1e-12, 1e6),
+            ("network.n_blocks", network.n_blocks as f64, 1.0, 64.0),
             ("training.t_max", self.training.t_max as f64, 1.0, STEPS),
             ("evaluation.every_env_steps", evaluation.every_env_steps as f64, 1.0, STEPS),
             ("evaluation.episodes", evaluation.episodes as f64, 1.0, COUNT),

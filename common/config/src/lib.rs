@@ -2,16 +2,18 @@
 //!
 //! Typed: an experiment's TOML and `--set section.key=value`, which are [`toml::Table`]s. Used: a [`Config`],
 //! complete and within its limits. [`resolve`] leads from one to the other: every key's default, below the
-//! task set's preset, below the experiment, below the command line. A run directory holds the resolved one.
+//! task set's preset, below the method's, below the experiment, below the command line. A run directory holds the
+//! resolved one.
 
 mod config;
+mod method_keys;
 mod regular_file;
 mod resolve;
 mod run_dir;
 
 pub use config::{
-    Actors, Algorithm, Checkpoints, Config, Environment, Evaluation, Learner, MixingKind, Network,
-    OptimizerName, SpawnRotate, Tls, Training, Until, Web, WebListen,
+    Actors, Algorithm, Checkpoints, Config, Environment, Evaluation, Learner, Network, OptimizerName,
+    SpawnRotate, Tls, Training, Until, Web, WebListen,
 };
 pub use regular_file::{TEXT_BYTES_MAX, read_regular, read_text};
 pub use resolve::{ConfigError, is_live, resolve, set, set_live};

@@ -1,6 +1,7 @@
 //! From what a person typed to a [`Config`].
 
-use crate::{Config, Environment, SpawnRotate};
+use crate::{Config, Environment, SpawnRotate, method_keys};
+use rit_algo::{Method, Regime};
 use rit_env::{
     TaskError, TaskSet, UnknownName,
     combat::{StatsVersion, world::ScriptedMedivac},
@@ -73,6 +74,46 @@ pub enum ConfigError {
         /// The task.
         name: String,
     },
+    /// A key that this method has no use for.
+    #[error("{key} means nothing to {method}; these have it: {owners}")]
+    NotOfMethod {
+        /// The key.
+        key: String,
+        /// The method.
+        method: Method,
+        /// Who has it.
+        owners: String,
+    },
+    /// A name that no method has.
+    #[error(
+        "unknown algorithm {name:?}; {}known: {}",
+        suggestion.map_or(String::new(), |known| format!("did you mean {known:?}? ")),
+        Method::ALL.map(Method::name).join(", ")
+    )]
+    UnknownMethod {
+        /// The name.
+        name: String,
+        /// The name that looks most like it.
+        suggestion: Option<&'static str>,
+    },
+    /// Another method for a run that has begun.
+    #[error("the run was begun with the algorithm {method} and cannot go on with {name}; start a new one")]
+    OtherMethod {
+        /// The run's.
+        method: Method,
+        /// What was typed.
+        name: Method,
+    },
+    /// Weights that are older than an on-policy method can learn with.
+    #[error(
+        "algorithm.policy_lag = {policy_lag}: {method} learns from each batch with the weights that rolled it; only 0 will do"
+    )]
+    OnPolicyLag {
+        /// The method.
+        method: Method,
+        /// What was typed.
+        policy_lag: usize,
+    },
     /// A word that means nothing there.
     #[error("{0}")]
     Name(#[from] UnknownName),
@@ -115,19 +156,20 @@ pub enum ConfigError {
 pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Result<Config, ConfigError> {
     let defaults = parse(include_str!("presets/all.toml"), "presets/all.toml")?;
     let mut typed = parse(experiment, source_name)?;
+    method_keys::translate_ablations(&mut typed, Method::Rit)?;
+    let mut set = Table::new();
     for setting in settings {
-        merge(&mut typed, setting.clone());
+        merge(&mut set, setting.clone());
     }
+    method_keys::translate_ablations(&mut set, method_keys::named(&typed)?)?;
+    merge(&mut typed, set);
     check_keys(&typed, &defaults, "")?;
-    let preset = match task_set(&typed)? {
-        TaskSet::MatrixGame => include_str!("presets/matrix.toml"),
-        TaskSet::CooperativeNavigation | TaskSet::PredatorPrey | TaskSet::PredatorPreyPro => {
-            include_str!("presets/mpe.toml")
-        }
-        TaskSet::Combat(_) => include_str!("presets/smac.toml"),
-    };
+    let (method, task_set) = (method_keys::named(&typed)?, task_set(&typed)?);
+    method_keys::check(&typed, method)?;
     let mut all = defaults;
-    merge(&mut all, parse(preset, "the task set's preset")?);
+    for preset in method_keys::presets(method, task_set)? {
+        merge(&mut all, preset);
+    }
     merge(&mut all, typed);
     let config: Config =
         all.try_into().map_err(|error: toml::de::Error| ConfigError::Value(one_line(&error)))?;
@@ -136,6 +178,9 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
         if !(min..=max).contains(&value) {
             return Err(ConfigError::Range { key, value, min, max });
         }
+    }
+    if method.facts().regime == Regime::OnPolicy && config.algorithm.policy_lag > 0 {
+        return Err(ConfigError::OnPolicyLag { method, policy_lag: config.algorithm.policy_lag });
     }
     let task_set = config.environment.task_set;
     let Environment { training_tasks, testing_tasks, spawn_rotate, stats, enemy_medivac, .. } =
@@ -250,9 +295,9 @@ fn is_under(key: &str, keys: &[&str]) -> bool {
     keys.iter().any(|one| key == *one || key.starts_with(&format!("{one}.")))
 }
 
-/// Every `section.key` with its value.
+/// Every `section.key` of the method with its value.
 fn flat(config: &Config) -> Result<BTreeMap<String, Value>, ConfigError> {
-    let table = Table::try_from(config).map_err(|error| ConfigError::Value(error.to_string()))?;
+    let table = config.to_table()?;
     let mut keys = BTreeMap::new();
     for (section, value) in table {
         match value {
@@ -284,7 +329,7 @@ pub fn is_live(key: &str) -> bool {
     is_under(key, &LIVE)
 }
 
-fn parse(text: &str, source_name: &str) -> Result<Table, ConfigError> {
+pub(crate) fn parse(text: &str, source_name: &str) -> Result<Table, ConfigError> {
     text.parse::<Table>().map_err(|error| ConfigError::Syntax {
         source_name: source_name.to_owned(),
         reason: one_line(&error),
@@ -378,7 +423,7 @@ fn task_set(typed: &Table) -> Result<TaskSet, ConfigError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{MixingKind, OptimizerName, Until};
+    use crate::{OptimizerName, Until};
 
     const MATRIX: &str = "environment.task_set = \"matrix-game\"";
 
@@ -414,7 +459,7 @@ mod tests {
     #[test]
     fn the_command_line_is_above_the_experiment() {
         let config = with(&["algorithm.gamma=0.5", "algorithm.mixing=sum", "seed=9"]).unwrap();
-        assert_eq!((config.algorithm.gamma, config.algorithm.mixing), (0.5, MixingKind::Sum));
+        assert_eq!((config.algorithm.gamma, config.algorithm.name), (0.5, Method::RitVdn));
         assert_eq!(config.seed.0, 9);
         assert_eq!(with(&["training.until=win_rate=1.0"]).unwrap().training.until, Until::WinRate(1.0));
         assert_eq!(with(&["algorithm.gamma=1", "algorithm.gamma=0"]).unwrap().algorithm.gamma, 0.0);
@@ -454,7 +499,7 @@ mod tests {
     #[test]
     fn what_is_written_leads_back() {
         let config = with(&["environment.view_radius=inf", "algorithm.lr=0.25"]).unwrap();
-        let text = toml::to_string(&config).unwrap();
+        let text = config.to_toml().unwrap();
         assert_eq!(resolve(&text, "config.toml", &[]), Ok(config));
     }
 
@@ -496,7 +541,7 @@ mod tests {
         assert!(message(&["web.listen=0.0.0.0:8080"]).contains("ssh -L 8080:127.0.0.1:8080 THIS-MACHINE"));
         assert!(message(&["web.listen=8080"]).contains("must be a word in quotes"));
         assert!(message(&["web.listen=on"]).ends_with("write \"127.0.0.1:PORT\" or \"off\""));
-        assert!(message(&["algorithm.mixing=vdn"]).contains("expected `network` or `sum`"));
+        assert_eq!(message(&["algorithm.mixing=vdn"]), "algorithm.mixing must be \"network\" or \"sum\"");
         assert!(
             message(&["environment.task_set=chess"])
                 .contains("unknown task set \"chess\"; known: matrix-game")

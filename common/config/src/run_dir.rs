@@ -1,6 +1,6 @@
 //! The run directory: where everything of one run lies, and under which names.
 
-use crate::{Config, ConfigError, resolve, resolve::may_go_on};
+use crate::{Config, ConfigError, method_keys, resolve, resolve::may_go_on};
 use rit_episode::wire::RunId;
 use std::{
     fs::{self, DirBuilder, OpenOptions, Permissions},
@@ -40,9 +40,6 @@ pub enum RunDirError {
     /// A file of ours that holds something else.
     #[error("{0} does not hold 32 hexadecimal digits; it was altered")]
     NotHex(PathBuf),
-    /// The configuration cannot be written down.
-    #[error("the configuration cannot be written as TOML: {0}")]
-    Serialize(#[from] toml::ser::Error),
     /// The system refused.
     #[error("{path}: {error}")]
     Io {
@@ -82,11 +79,15 @@ impl RunDir {
         };
         write(run_dir.root.join(RUN_ID), hex(run_id) + "\n")?;
         write(run_dir.root.join(TOKEN), run_dir.token.clone() + "\n")?;
-        write(run_dir.config_path(), toml::to_string(config)?)?;
+        write(run_dir.config_path(), run_dir.to_toml(config)?)?;
         for folder in [run_dir.logs(), run_dir.checkpoints()] {
             DirBuilder::new().mode(0o700).create(&folder).map_err(io(&folder))?;
         }
         Ok(run_dir)
+    }
+
+    fn to_toml(&self, config: &Config) -> Result<String, RunDirError> {
+        config.to_toml().map_err(|error| RunDirError::Config { path: self.config_path(), error })
     }
 
     /// Makes the next free directory `{parent}/{name}-{n}`.
@@ -134,6 +135,7 @@ impl RunDir {
         let io = |error| RunDirError::Io { path: path.clone(), error };
         let text = fs::read_to_string(&path).map_err(io)?;
         let wrong = |error| RunDirError::Config { path: path.clone(), error };
+        method_keys::same(old.algorithm.name, settings).map_err(wrong)?;
         let new = resolve(&text, "config.toml", settings).map_err(wrong)?;
         may_go_on(&old, &new).map_err(wrong)?;
         if new != old {
@@ -149,7 +151,7 @@ impl RunDir {
     pub fn write_config(&self, config: &Config) -> Result<(), RunDirError> {
         let path = self.config_path();
         let partial = path.with_extension("partial");
-        fs::write(&partial, toml::to_string(config)?)
+        fs::write(&partial, self.to_toml(config)?)
             .and_then(|()| fs::rename(&partial, &path))
             .map_err(|error| RunDirError::Io { path, error })
     }

@@ -2,7 +2,7 @@
 
 use super::{Measured, Report, cpu_s, random_episodes, thread_cpu_s};
 use crate::failure::Failure;
-use rit_algo::{Learner, learner::Draw};
+use rit_algo::{Learner, Regime, learner::Draw};
 use rit_env::{Split, Task};
 use rit_episode::Stream;
 use rit_learner::replay::Replay;
@@ -69,9 +69,14 @@ pub(super) fn measure(
     }
 
     let mut number = 0;
+    // A method that learns from each batch once takes as many episodes as are rolled for an update.
+    let batch_size = match learner.regime() {
+        Regime::Replay => config.algorithm.batch_size,
+        Regime::OnPolicy => config.algorithm.n_rollout_threads,
+    };
     let mut one_update = |learner: &mut dyn Learner| {
         let draw = Draw { seed: config.seed, update: number };
-        let batch = replay.sample(config.algorithm.batch_size, &mut draw.stream(Stream::Replay));
+        let batch = replay.sample(batch_size, &mut draw.stream(Stream::Replay));
         number += 1;
         learner.learn(&batch, draw).map_err(Failure::runtime)
     };

@@ -15,7 +15,7 @@ use crate::{
     failure::Failure,
     player::Trained,
 };
-use rit_algo::Model;
+use rit_algo::{Method, Model};
 use rit_config::Config;
 use rit_env::{
     Script, Task,
@@ -29,14 +29,11 @@ use std::{process::ExitCode, sync::Arc, time::Duration};
 /// `rit bench`.
 #[allow(clippy::print_stdout, reason = "what the command is for")]
 pub fn run(options: &BenchOptions) -> Result<ExitCode, Failure> {
-    let measured = Measured::new(options)?;
     let duration = Duration::from_secs_f64(options.seconds);
-    let mut report = match options.kind {
-        BenchKind::Learner => learner::run(&measured, duration)?,
-        BenchKind::Rollout => rollout::run(&measured, duration)?,
-        BenchKind::Env => env::run(&measured.config, duration)?,
-        BenchKind::Ipc => ipc::run(options.payload_kib, duration)?,
-        BenchKind::Scale => scale::run(&measured, &options.experiment, &options.settings, duration)?,
+    let mut report = if options.algorithm.as_deref() == Some(ALL) {
+        every_method(options, duration)?
+    } else {
+        one_method(options, duration)?
     };
     report.insert("bench".into(), options.kind.to_string().into());
     if let Some(run) = &options.run {
@@ -62,6 +59,47 @@ pub fn run(options: &BenchOptions) -> Result<ExitCode, Failure> {
     Ok(ExitCode::SUCCESS)
 }
 
+fn one_method(options: &BenchOptions, duration: Duration) -> Result<Report, Failure> {
+    let settings =
+        options.settings.iter().cloned().chain(experiments::algorithm(options.algorithm.as_deref()));
+    let settings: Vec<String> = settings.collect();
+    let measured = Measured::new(options, &settings)?;
+    let mut report = match options.kind {
+        BenchKind::Learner => learner::run(&measured, duration)?,
+        BenchKind::Rollout => rollout::run(&measured, duration)?,
+        BenchKind::Env => env::run(&measured.config, duration)?,
+        BenchKind::Ipc => return ipc::run(options.payload_kib, duration),
+        BenchKind::Scale => scale::run(&measured, &options.experiment, &settings, duration)?,
+    };
+    report.insert("algorithm".into(), measured.model.method().name().into());
+    Ok(report)
+}
+
+/// `--algorithm all`: one update, and rolling, of every method that there is.
+fn every_method(options: &BenchOptions, duration: Duration) -> Result<Report, Failure> {
+    if options.kind != BenchKind::Learner {
+        let kind = options.kind;
+        return Err(Failure::input_message(format!(
+            "`rit bench {kind}` measures one algorithm; --algorithm {ALL} is for learner"
+        )));
+    }
+    let mut rows = Vec::new();
+    for method in Method::ALL.into_iter().filter(|method| method.facts().built) {
+        let settings = options.settings.iter().cloned().chain(experiments::algorithm(Some(method.name())));
+        let report = learner::run(&Measured::new(options, &settings.collect::<Vec<_>>())?, duration)?;
+        let mut row = Report::new();
+        row.insert("algorithm".into(), method.name().into());
+        for key in ["parameters", "update_cpu_ms", "update_wall_ms", "update_gflop", "gemm_share"] {
+            row.insert(key.into(), report[key].clone());
+        }
+        rows.push(Value::Object(row));
+    }
+    Ok(Report::from_iter([("algorithms".into(), rows.into())]))
+}
+
+/// Every method, in `--algorithm`.
+const ALL: &str = "all";
+
 /// Whose networks are measured.
 struct Measured {
     config: Config,
@@ -71,9 +109,9 @@ struct Measured {
 
 impl Measured {
     /// An experiment's fresh networks, or those that a run has come to.
-    fn new(options: &BenchOptions) -> Result<Self, Failure> {
+    fn new(options: &BenchOptions, settings: &[String]) -> Result<Self, Failure> {
         let Some(run) = &options.run else {
-            let config = experiments::load(&options.experiment, &options.settings)?.config;
+            let config = experiments::load(&options.experiment, settings)?.config;
             let model = Arc::new(Model::new(config.model()).map_err(Failure::input)?);
             let params = model.initial(&mut config.seed.stream(Stream::Weights, 0));
             return Ok(Self { config, model, params });

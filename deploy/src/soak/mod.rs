@@ -53,6 +53,7 @@ pub async fn run(options: SoakOptions) -> Result<ExitCode, Failure> {
     }
     // What is wrong with the experiment is said before anything is made.
     let mut settings = options.settings.clone();
+    settings.extend(experiments::algorithm(options.algorithm.as_deref()));
     settings.push(format!("seed={}", options.seed));
     settings.extend(options.steps.map(|steps| format!("training.t_max={steps}")));
     settings.push(format!("actors.count={}", options.actors));

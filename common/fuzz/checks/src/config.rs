@@ -28,7 +28,7 @@ pub fn check(input: &[u8]) -> bool {
     for task in config.tasks(rit_env::Split::Training) {
         task.environment(config.environment_options());
     }
-    let written = toml::to_string(&config).map_err(|error| error.to_string());
+    let written = config.to_toml().map_err(|error| error.to_string());
     let again = written.map(|written| resolve(&written, "config.toml", &[]));
     assert_eq!(again, Ok(Ok(config)));
     true
