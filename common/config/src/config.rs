@@ -2,7 +2,9 @@
 
 use crate::{
     ConfigError,
+    keys::quoted,
     method_keys::{self, by_name},
+    number,
 };
 use rit_algo::{Method, ModelConfig, PpoConfig, Regime, TerminalStates, UpdateConfig, method::Encoder};
 use rit_env::{
@@ -40,7 +42,9 @@ pub struct Environment {
     pub task_set: TaskSet,
     pub training_tasks: Vec<String>,
     pub testing_tasks: Vec<String>,
+    #[serde(serialize_with = "number::shortest")]
     pub view_radius: f32,
+    #[serde(serialize_with = "number::shortest")]
     pub approach_shaping: f32,
     pub spawn_rotate: SpawnRotate,
     pub stats: StatsVersion,
@@ -68,25 +72,35 @@ pub struct Algorithm {
     pub name: Method,
     pub encoder: EncoderName,
     pub random_permutation: bool,
+    #[serde(serialize_with = "number::shortest")]
     pub gamma: f32,
     pub optimizer: OptimizerName,
+    #[serde(serialize_with = "number::shortest")]
     pub lr: f32,
+    #[serde(serialize_with = "number::shortest")]
     pub rmsprop_alpha: f32,
+    #[serde(serialize_with = "number::shortest")]
     pub optimizer_eps: f32,
     pub grad_norm_clip: f64,
     pub epsilon_start: f64,
     pub epsilon_finish: f64,
     pub epsilon_anneal_steps: u64,
+    #[serde(serialize_with = "number::shortest")]
     pub exploration_persistence: f32,
     pub n_rollout_threads: usize,
     pub buffer_size: usize,
     pub batch_size: usize,
     pub target_update_interval: u64,
     pub policy_lag: usize,
+    #[serde(serialize_with = "number::shortest")]
     pub imagined_weight: f32,
+    #[serde(serialize_with = "number::shortest")]
     pub role_entropy_weight: f32,
+    #[serde(serialize_with = "number::shortest")]
     pub role_kl_weight: f32,
+    #[serde(serialize_with = "number::shortest")]
     pub role_dissimilarity_weight: f32,
+    #[serde(serialize_with = "number::shortest")]
     pub role_soft_constraint: f32,
     pub epochs: usize,
     pub minibatches: usize,
@@ -134,6 +148,7 @@ pub struct Network {
     pub feedforward_dim: usize,
     pub role_dim: usize,
     pub role_hidden_dim: usize,
+    #[serde(serialize_with = "number::shortest")]
     pub role_variance_floor: f32,
     pub n_blocks: usize,
 }
@@ -163,7 +178,12 @@ impl TryFrom<String> for Until {
     type Error = String;
 
     fn try_from(text: String) -> Result<Self, String> {
-        let error = || format!("training.until = {text:?}; write win_rate=NUMBER or mean_return=NUMBER");
+        let error = || {
+            let text = quoted(&text);
+            format!(
+                "training.until = {text}; write win_rate=NUMBER or mean_return=NUMBER; a win rate lies in 0..=1"
+            )
+        };
         if text.is_empty() {
             return Ok(Self::Never);
         }
@@ -273,7 +293,7 @@ impl TryFrom<String> for WebListen {
                  reach it from another machine with ssh -L {port}:127.0.0.1:{port} THIS-MACHINE",
                 port = address.port()
             )),
-            Err(_) => Err(format!("web.listen = {text:?}; write \"127.0.0.1:PORT\" or \"off\"")),
+            Err(_) => Err(format!("web.listen = {}; write \"127.0.0.1:PORT\" or \"off\"", quoted(&text))),
         }
     }
 }
@@ -423,7 +443,7 @@ impl Config {
     }
 
     /// Every number's name, value, smallest and largest.
-    pub(crate) fn limits(&self) -> Vec<(&'static str, f64, f64, f64)> {
+    pub(crate) fn limits(&self) -> Vec<(&'static str, Number, f64, f64)> {
         let (algorithm, network, evaluation) = (&self.algorithm, &self.network, &self.evaluation);
         // Beyond what anybody runs; they keep a slip of the keyboard from taking all memory.
         const COUNT: f64 = 1e6;
@@ -434,57 +454,110 @@ impl Config {
             ("environment.approach_shaping", self.environment.approach_shaping.into(), 0.0, 1e3),
             ("algorithm.gamma", algorithm.gamma.into(), 0.0, 1.0),
             ("algorithm.lr", algorithm.lr.into(), 1e-12, 1.0),
-            ("algorithm.rmsprop_alpha", algorithm.rmsprop_alpha.into(), 0.0, 1.0),
+            // At 1 it would never take a gradient in, and every step would be a division by almost nothing.
+            ("algorithm.rmsprop_alpha", algorithm.rmsprop_alpha.into(), 0.0, 0.999_999),
             ("algorithm.optimizer_eps", algorithm.optimizer_eps.into(), 1e-12, 1.0),
-            ("algorithm.grad_norm_clip", algorithm.grad_norm_clip, 1e-6, f64::INFINITY),
-            ("algorithm.epsilon_start", algorithm.epsilon_start, 0.0, 1.0),
-            ("algorithm.epsilon_finish", algorithm.epsilon_finish, 0.0, 1.0),
+            ("algorithm.grad_norm_clip", algorithm.grad_norm_clip.into(), 1e-6, f64::INFINITY),
+            ("algorithm.epsilon_start", algorithm.epsilon_start.into(), 0.0, 1.0),
+            ("algorithm.epsilon_finish", algorithm.epsilon_finish.into(), 0.0, 1.0),
             ("algorithm.exploration_persistence", algorithm.exploration_persistence.into(), 0.0, 1.0),
-            ("algorithm.epsilon_anneal_steps", algorithm.epsilon_anneal_steps as f64, 1.0, STEPS),
-            ("algorithm.n_rollout_threads", algorithm.n_rollout_threads as f64, 1.0, 4096.0),
-            ("algorithm.buffer_size", algorithm.buffer_size as f64, 1.0, COUNT),
-            ("algorithm.batch_size", algorithm.batch_size as f64, 1.0, algorithm.buffer_size as f64),
-            ("algorithm.target_update_interval", algorithm.target_update_interval as f64, 1.0, STEPS),
-            ("algorithm.policy_lag", algorithm.policy_lag as f64, 0.0, 64.0),
+            ("algorithm.epsilon_anneal_steps", algorithm.epsilon_anneal_steps.into(), 1.0, STEPS),
+            ("algorithm.n_rollout_threads", algorithm.n_rollout_threads.into(), 1.0, 4096.0),
+            ("algorithm.buffer_size", algorithm.buffer_size.into(), 1.0, COUNT),
+            ("algorithm.batch_size", algorithm.batch_size.into(), 1.0, algorithm.buffer_size as f64),
+            ("algorithm.target_update_interval", algorithm.target_update_interval.into(), 1.0, STEPS),
+            ("algorithm.policy_lag", algorithm.policy_lag.into(), 0.0, 64.0),
             ("algorithm.imagined_weight", algorithm.imagined_weight.into(), 0.0, 1.0),
             ("algorithm.role_entropy_weight", algorithm.role_entropy_weight.into(), 0.0, 1e6),
             ("algorithm.role_kl_weight", algorithm.role_kl_weight.into(), 0.0, 1e6),
             ("algorithm.role_dissimilarity_weight", algorithm.role_dissimilarity_weight.into(), 0.0, 1e6),
             ("algorithm.role_soft_constraint", algorithm.role_soft_constraint.into(), 0.0, 1e6),
-            ("algorithm.epochs", algorithm.epochs as f64, 1.0, 1000.0),
-            ("algorithm.minibatches", algorithm.minibatches as f64, 1.0, algorithm.n_rollout_threads as f64),
-            ("algorithm.clip", algorithm.clip, 1e-6, 1e6),
-            ("algorithm.gae_lambda", algorithm.gae_lambda, 0.0, 1.0),
-            ("algorithm.entropy_coef", algorithm.entropy_coef, 0.0, 1e6),
-            ("algorithm.value_coef", algorithm.value_coef, 0.0, 1e6),
-            ("algorithm.huber_delta", algorithm.huber_delta, 1e-6, 1e6),
-            ("algorithm.value_norm_beta", algorithm.value_norm_beta, 0.0, 1.0),
-            ("network.hidden_dim", network.hidden_dim as f64, 1.0, SIZE),
-            ("network.attention_dim", network.attention_dim as f64, 1.0, SIZE),
-            ("network.n_heads", network.n_heads as f64, 1.0, 64.0),
-            ("network.task_representation_dim", network.task_representation_dim as f64, 1.0, SIZE),
-            ("network.reward_embed_dim", network.reward_embed_dim as f64, 1.0, SIZE),
-            ("network.mixing_embed_dim", network.mixing_embed_dim as f64, 1.0, SIZE),
-            ("network.hypernet_embed_dim", network.hypernet_embed_dim as f64, 1.0, SIZE),
-            ("network.feedforward_dim", network.feedforward_dim as f64, 1.0, SIZE),
-            ("network.role_dim", network.role_dim as f64, 1.0, SIZE),
-            ("network.role_hidden_dim", network.role_hidden_dim as f64, 1.0, SIZE),
+            ("algorithm.epochs", algorithm.epochs.into(), 1.0, 1000.0),
+            ("algorithm.minibatches", algorithm.minibatches.into(), 1.0, algorithm.n_rollout_threads as f64),
+            ("algorithm.clip", algorithm.clip.into(), 1e-6, 1e6),
+            ("algorithm.gae_lambda", algorithm.gae_lambda.into(), 0.0, 1.0),
+            ("algorithm.entropy_coef", algorithm.entropy_coef.into(), 0.0, 1e6),
+            ("algorithm.value_coef", algorithm.value_coef.into(), 0.0, 1e6),
+            ("algorithm.huber_delta", algorithm.huber_delta.into(), 1e-6, 1e6),
+            ("algorithm.value_norm_beta", algorithm.value_norm_beta.into(), 0.0, 1.0),
+            ("network.hidden_dim", network.hidden_dim.into(), 1.0, SIZE),
+            ("network.attention_dim", network.attention_dim.into(), 1.0, SIZE),
+            ("network.n_heads", network.n_heads.into(), 1.0, 64.0),
+            ("network.task_representation_dim", network.task_representation_dim.into(), 1.0, SIZE),
+            ("network.reward_embed_dim", network.reward_embed_dim.into(), 1.0, SIZE),
+            ("network.mixing_embed_dim", network.mixing_embed_dim.into(), 1.0, SIZE),
+            ("network.hypernet_embed_dim", network.hypernet_embed_dim.into(), 1.0, SIZE),
+            ("network.feedforward_dim", network.feedforward_dim.into(), 1.0, SIZE),
+            ("network.role_dim", network.role_dim.into(), 1.0, SIZE),
+            ("network.role_hidden_dim", network.role_hidden_dim.into(), 1.0, SIZE),
             ("network.role_variance_floor", network.role_variance_floor.into(), 1e-12, 1e6),
-            ("network.n_blocks", network.n_blocks as f64, 1.0, 64.0),
-            ("training.t_max", self.training.t_max as f64, 1.0, STEPS),
-            ("evaluation.every_env_steps", evaluation.every_env_steps as f64, 1.0, STEPS),
-            ("evaluation.episodes", evaluation.episodes as f64, 1.0, COUNT),
-            ("evaluation.testing_episodes", evaluation.testing_episodes as f64, 1.0, COUNT),
-            ("checkpoints.every_env_steps", self.checkpoints.every_env_steps as f64, 1.0, STEPS),
-            ("checkpoints.keep", self.checkpoints.keep as f64, 1.0, COUNT),
-            ("actors.count", self.actors.count as f64, 0.0, 256.0),
-            ("actors.count_max", self.actors.count_max as f64, 1.0, 256.0),
-            ("actors.remote", self.actors.remote as f64, 0.0, 256.0),
-            ("actors.episodes_at_once", self.actors.episodes_at_once as f64, 1.0, 4096.0),
-            ("actors.heartbeat_timeout_ms", self.actors.heartbeat_timeout_ms as f64, 2000.0, 3_600_000.0),
-            ("learner.shards", self.learner.shards as f64, 1.0, 256.0),
-            ("learner.threads", self.learner.threads as f64, 1.0, 256.0),
-            ("learner.metrics_every_env_steps", self.learner.metrics_every_env_steps as f64, 1.0, STEPS),
+            ("network.n_blocks", network.n_blocks.into(), 1.0, 64.0),
+            ("training.t_max", self.training.t_max.into(), 1.0, STEPS),
+            ("evaluation.every_env_steps", evaluation.every_env_steps.into(), 1.0, STEPS),
+            ("evaluation.episodes", evaluation.episodes.into(), 1.0, COUNT),
+            ("evaluation.testing_episodes", evaluation.testing_episodes.into(), 1.0, COUNT),
+            ("checkpoints.every_env_steps", self.checkpoints.every_env_steps.into(), 1.0, STEPS),
+            ("checkpoints.keep", self.checkpoints.keep.into(), 1.0, COUNT),
+            ("actors.count", self.actors.count.into(), 0.0, 256.0),
+            ("actors.count_max", self.actors.count_max.into(), 1.0, 256.0),
+            ("actors.remote", self.actors.remote.into(), 0.0, 256.0),
+            ("actors.episodes_at_once", self.actors.episodes_at_once.into(), 1.0, 4096.0),
+            ("actors.heartbeat_timeout_ms", self.actors.heartbeat_timeout_ms.into(), 2000.0, 3_600_000.0),
+            ("learner.shards", self.learner.shards.into(), 1.0, 256.0),
+            ("learner.threads", self.learner.threads.into(), 1.0, 256.0),
+            ("learner.metrics_every_env_steps", self.learner.metrics_every_env_steps.into(), 1.0, STEPS),
         ]
+    }
+}
+
+/// A number of the configuration, in its own precision: a bound typed as 1e-12 is within the bound 1e-12.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Number {
+    Whole(u64),
+    Single(f32),
+    Real(f64),
+}
+
+impl Number {
+    /// Whether it lies in this range; a NaN lies in none.
+    pub(crate) fn check(self, key: &str, min: f64, max: f64) -> Result<(), ConfigError> {
+        let (within, value, min, max) = match self {
+            Self::Whole(value) => {
+                let (min, max) = (min as u64, max as u64);
+                ((min..=max).contains(&value), value.to_string(), min.to_string(), max.to_string())
+            }
+            Self::Single(value) => {
+                let (min, max) = (min as f32, max as f32);
+                ((min..=max).contains(&value), number::shown(value), number::shown(min), number::shown(max))
+            }
+            Self::Real(value) => {
+                ((min..=max).contains(&value), number::shown(value), number::shown(min), number::shown(max))
+            }
+        };
+        if within { Ok(()) } else { Err(ConfigError::Range { key: key.to_owned(), value, min, max }) }
+    }
+}
+
+impl From<u64> for Number {
+    fn from(value: u64) -> Self {
+        Self::Whole(value)
+    }
+}
+
+impl From<usize> for Number {
+    fn from(value: usize) -> Self {
+        Self::Whole(value as u64)
+    }
+}
+
+impl From<f32> for Number {
+    fn from(value: f32) -> Self {
+        Self::Single(value)
+    }
+}
+
+impl From<f64> for Number {
+    fn from(value: f64) -> Self {
+        Self::Real(value)
     }
 }

@@ -6,7 +6,10 @@
 //! resolved one.
 
 mod config;
+mod error;
+mod keys;
 mod method_keys;
+mod number;
 mod regular_file;
 mod resolve;
 mod run_dir;
@@ -15,6 +18,8 @@ pub use config::{
     Actors, Algorithm, Checkpoints, Config, Environment, Evaluation, Learner, Network, OptimizerName,
     SpawnRotate, Tls, Training, Until, Web, WebListen,
 };
+pub use error::ConfigError;
+pub use number::{CountError, WHOLE_MAX, count};
 pub use regular_file::{TEXT_BYTES_MAX, read_regular, read_text};
-pub use resolve::{ConfigError, is_live, resolve, set, set_live};
+pub use resolve::{is_live, key_like, resolve, set, set_live};
 pub use run_dir::{RunDir, RunDirError};

@@ -1,160 +1,23 @@
 //! From what a person typed to a [`Config`].
 
-use crate::{Config, Environment, SpawnRotate, method_keys};
+use crate::{Config, ConfigError, Environment, SpawnRotate, Until, keys, method_keys};
 use rit_algo::{Method, Regime};
 use rit_env::{
-    TaskError, TaskSet, UnknownName,
+    TaskSet,
     combat::{StatsVersion, world::ScriptedMedivac},
 };
 use std::collections::BTreeMap;
 use toml::{Table, Value};
 
-/// What is wrong with what was typed. Every message names the key and what would do.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-pub enum ConfigError {
-    /// Not TOML.
-    #[error("{source_name} is not TOML: {reason}")]
-    Syntax {
-        /// The file or option.
-        source_name: String,
-        /// What the parser said, in one line.
-        reason: String,
-    },
-    /// No such key.
-    #[error("unknown key {key:?}{}", suggestion.as_ref().map_or(String::new(), |known| format!("; did you mean {known:?}?")))]
-    UnknownKey {
-        /// The key.
-        key: String,
-        /// The key that looks most like it.
-        suggestion: Option<String>,
-    },
-    /// A value of another kind.
-    #[error("{key} must be {expected}, not {found}")]
-    Kind {
-        /// The key.
-        key: String,
-        /// The kind it must have.
-        expected: &'static str,
-        /// The kind it has.
-        found: &'static str,
-    },
-    /// A number out of its range.
-    #[error("{key} = {value} is out of range {min}..={max}")]
-    Range {
-        /// The key.
-        key: &'static str,
-        /// Its value.
-        value: f64,
-        /// Its smallest.
-        min: f64,
-        /// Its largest.
-        max: f64,
-    },
-    /// A number that changes nothing in this task set.
-    #[error("{key} means nothing to {task_set}; leave it out")]
-    Meaningless {
-        /// The key.
-        key: &'static str,
-        /// The task set.
-        task_set: TaskSet,
-    },
-    /// A name that is no task of the set.
-    #[error("{key}: {error}")]
-    Task {
-        /// The key.
-        key: &'static str,
-        /// What is wrong with the name.
-        error: TaskError,
-    },
-    /// A task that is listed twice.
-    #[error("{key} lists {name} twice")]
-    TaskTwice {
-        /// The key.
-        key: &'static str,
-        /// The task.
-        name: String,
-    },
-    /// A key that this method has no use for.
-    #[error("{key} means nothing to {method}; these have it: {owners}")]
-    NotOfMethod {
-        /// The key.
-        key: String,
-        /// The method.
-        method: Method,
-        /// Who has it.
-        owners: String,
-    },
-    /// A name that no method has.
-    #[error(
-        "unknown algorithm {name:?}; {}known: {}",
-        suggestion.map_or(String::new(), |known| format!("did you mean {known:?}? ")),
-        Method::ALL.map(Method::name).join(", ")
-    )]
-    UnknownMethod {
-        /// The name.
-        name: String,
-        /// The name that looks most like it.
-        suggestion: Option<&'static str>,
-    },
-    /// Another method for a run that has begun.
-    #[error("the run was begun with the algorithm {method} and cannot go on with {name}; start a new one")]
-    OtherMethod {
-        /// The run's.
-        method: Method,
-        /// What was typed.
-        name: Method,
-    },
-    /// Weights that are older than an on-policy method can learn with.
-    #[error(
-        "algorithm.policy_lag = {policy_lag}: {method} learns from each batch with the weights that rolled it; only 0 will do"
-    )]
-    OnPolicyLag {
-        /// The method.
-        method: Method,
-        /// What was typed.
-        policy_lag: usize,
-    },
-    /// A word that means nothing there.
-    #[error("{0}")]
-    Name(#[from] UnknownName),
-    /// An experiment that does not say what to train on.
-    #[error("the experiment names no environment.task_set; known: {known}")]
-    NoTaskSet {
-        /// Those there are.
-        known: String,
-    },
-    /// A key that a run under way cannot change.
-    #[error("{key} cannot change in a run that has begun; start a new one")]
-    Fixed {
-        /// The key.
-        key: String,
-    },
-    /// Nobody would roll episodes.
-    #[error(
-        "actors.count = 0 leaves the run nobody who rolls episodes; `rit ctl pause` lets it rest, and with actors.remote \
-         actors on other hosts may do all of it"
-    )]
-    NoActors,
-    /// A key that a running learner cannot change.
-    #[error("{key} cannot change while the learner runs; these can: {}", LIVE.join(", "))]
-    NotLive {
-        /// The key.
-        key: String,
-    },
-    /// Values that cannot go together.
-    #[error("{0}")]
-    Model(#[from] rit_algo::ConfigError),
-    /// What is left for the deserialiser to find: a word that is none of its choices.
-    #[error("{0}")]
-    Value(String),
-}
+/// Every key with its default.
+const DEFAULTS: &str = include_str!("presets/all.toml");
 
 /// Resolves an experiment and what the command line sets, in ascending order of precedence.
 ///
 /// # Errors
 /// The first thing found wrong.
 pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Result<Config, ConfigError> {
-    let defaults = parse(include_str!("presets/all.toml"), "presets/all.toml")?;
+    let defaults = defaults()?;
     let mut typed = parse(experiment, source_name)?;
     method_keys::translate_ablations(&mut typed, Method::Rit)?;
     let mut set = Table::new();
@@ -163,7 +26,7 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
     }
     method_keys::translate_ablations(&mut set, method_keys::named(&typed)?)?;
     merge(&mut typed, set);
-    check_keys(&typed, &defaults, "")?;
+    keys::check(&typed, &defaults)?;
     let (method, task_set) = (method_keys::named(&typed)?, task_set(&typed)?);
     method_keys::check(&typed, method)?;
     let mut all = defaults;
@@ -171,18 +34,17 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
         merge(&mut all, preset);
     }
     merge(&mut all, typed);
-    let config: Config =
-        all.try_into().map_err(|error: toml::de::Error| ConfigError::Value(one_line(&error)))?;
+    let config: Config = all.try_into().map_err(|error| wrong_value(&error))?;
     for (key, value, min, max) in config.limits() {
-        // Written so that a NaN is out of every range.
-        if !(min..=max).contains(&value) {
-            return Err(ConfigError::Range { key, value, min, max });
-        }
+        value.check(key, min, max)?;
     }
     if method.facts().regime == Regime::OnPolicy && config.algorithm.policy_lag > 0 {
         return Err(ConfigError::OnPolicyLag { method, policy_lag: config.algorithm.policy_lag });
     }
     let task_set = config.environment.task_set;
+    if matches!(config.training.until, Until::WinRate(_)) && !task_set.has_wins() {
+        return Err(ConfigError::NoWins { until: config.training.until.into(), task_set });
+    }
     let Environment { training_tasks, testing_tasks, spawn_rotate, stats, enemy_medivac, .. } =
         &config.environment;
     for (key, names) in
@@ -213,20 +75,27 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
     Ok(config)
 }
 
-/// One `section.key=value` of the command line. A value that is no TOML is taken as a word.
+/// One `section.key=value` of the command line: one key, whatever the value holds.
 ///
 /// # Errors
-/// When there is no `=` or no key.
+/// When there is no `=`, no such key, or the value is of another kind.
 pub fn set(assignment: &str) -> Result<Table, ConfigError> {
-    // Whatever a shell lets through, the message is one line.
-    let source_name = || format!("--set {}", assignment.replace(char::is_control, " "));
-    let Some((key, value)) = assignment.split_once('=') else {
-        let reason = "write --set section.key=value".to_owned();
-        return Err(ConfigError::Syntax { source_name: source_name(), reason });
-    };
-    let (key, value) = (key.trim(), value.trim());
-    parse(&format!("{key} = {value}"), &source_name())
-        .or_else(|_| parse(&format!("{key} = {value:?}"), &source_name()))
+    let no_assignment = || ConfigError::NoAssignment(keys::quoted(assignment));
+    let (key, text) = assignment.split_once('=').ok_or_else(no_assignment)?;
+    let (key, text) = (key.trim(), text.trim());
+    if key.is_empty() {
+        return Err(no_assignment());
+    }
+    let value = keys::read(key, text, &defaults()?)?;
+    let (sections, name) = key.rsplit_once('.').unwrap_or(("", key));
+    let table = Table::from_iter([(name.to_owned(), value)]);
+    let sections = sections.rsplit('.').filter(|section| !section.is_empty());
+    Ok(sections.fold(table, |table, section| Table::from_iter([(section.to_owned(), table.into())])))
+}
+
+/// The key that somebody may have meant who wrote this name, such as an option that does not exist.
+pub fn key_like(name: &str) -> Option<String> {
+    keys::closest(name, &defaults().ok()?)
 }
 
 /// Keys, or sections, that a run may change when it goes on: no weight follows from them.
@@ -245,7 +114,7 @@ const FREE: [&str; 10] = [
 
 /// Keys that a running learner can change. Of these `algorithm.epsilon_finish` changes the
 /// result, and `evaluation` does where `training.until` ends the run at an evaluation.
-const LIVE: [&str; 7] = [
+pub(crate) const LIVE: [&str; 7] = [
     "algorithm.epsilon_finish",
     "evaluation.every_env_steps",
     "evaluation.episodes",
@@ -269,8 +138,8 @@ pub fn set_live(config: &Config, settings: &[Table]) -> Result<Config, ConfigErr
         return Err(ConfigError::NoActors);
     }
     if count > max.max(config.actors.count) {
-        let (key, value, max) = ("actors.count", count as f64, max as f64);
-        return Err(ConfigError::Range { key, value, min: 0.0, max });
+        let (key, min) = ("actors.count".to_owned(), "0".to_owned());
+        return Err(ConfigError::Range { key, value: count.to_string(), min, max: max.to_string() });
     }
     Ok(new)
 }
@@ -317,8 +186,6 @@ pub(crate) fn result_settings(config: &Config) -> Result<BTreeMap<String, String
     let keys = flat(config)?.into_iter().filter(|(key, _)| !is_under(key, &FREE));
     let shown = |value: Value| match value {
         Value::String(text) => text,
-        // 0.99, where an f32 is 0.9900000095367432 on its way through TOML's f64.
-        Value::Float(number) if f64::from(number as f32) == number => (number as f32).to_string(),
         value => value.to_string(),
     };
     Ok(keys.map(|(key, value)| (key, shown(value))).collect())
@@ -329,15 +196,43 @@ pub fn is_live(key: &str) -> bool {
     is_under(key, &LIVE)
 }
 
+fn defaults() -> Result<Table, ConfigError> {
+    parse(DEFAULTS, "presets/all.toml")
+}
+
 pub(crate) fn parse(text: &str, source_name: &str) -> Result<Table, ConfigError> {
-    text.parse::<Table>().map_err(|error| ConfigError::Syntax {
-        source_name: source_name.to_owned(),
-        reason: one_line(&error),
+    text.parse::<Table>().map_err(|error| {
+        let before = error.span().and_then(|span| text.get(..span.start)).unwrap_or_default();
+        let last_line = before.rsplit('\n').next().unwrap_or_default();
+        ConfigError::Syntax {
+            source_name: source_name.to_owned(),
+            line: before.matches('\n').count() + 1,
+            column: last_line.chars().count() + 1,
+            reason: one_line(&error),
+        }
     })
 }
 
 fn one_line(error: &toml::de::Error) -> String {
     error.message().lines().collect::<Vec<_>>().join("; ")
+}
+
+/// What the deserialiser found, with the key, which it names apart from its message.
+fn wrong_value(error: &toml::de::Error) -> ConfigError {
+    let (text, message) = (error.to_string(), one_line(error));
+    let named = text.lines().rev().find_map(|line| line.strip_prefix("in `")?.strip_suffix('`'));
+    let key = named.unwrap_or_default().to_owned();
+    let choice = message.strip_prefix("unknown variant `").and_then(|rest| rest.split_once("`, expected "));
+    if let Some((found, choices)) = choice {
+        let choices = choices.trim_start_matches("one of ").replace(" or ", ", ").replace('`', "");
+        return ConfigError::Choice { key, found: keys::quoted(found), choices };
+    }
+    // Types that read a text of their own name the key themselves.
+    ConfigError::Value(if key.is_empty() || message.contains(&key) {
+        message
+    } else {
+        format!("{key}: {message}")
+    })
 }
 
 /// Puts `above` over `below`, table by table.
@@ -350,68 +245,6 @@ fn merge(below: &mut Table, above: Table) {
             }
         }
     }
-}
-
-/// Every typed key must be one of the defaults', and of its kind.
-fn check_keys(typed: &Table, defaults: &Table, prefix: &str) -> Result<(), ConfigError> {
-    for (name, value) in typed {
-        let key = format!("{prefix}{name}");
-        let Some(default) = defaults.get(name) else {
-            return Err(ConfigError::UnknownKey { suggestion: closest(&key), key });
-        };
-        match (value, default) {
-            (Value::Table(value), Value::Table(default)) => check_keys(value, default, &format!("{key}."))?,
-            // A whole number will do for a real one.
-            (Value::Integer(_), Value::Float(_)) => {}
-            (Value::Integer(number), Value::Integer(_)) if *number < 0 => {
-                return Err(ConfigError::Kind {
-                    key,
-                    expected: "a whole number of at least 0",
-                    found: "a negative one",
-                });
-            }
-            _ if value.same_type(default) => {}
-            _ => return Err(ConfigError::Kind { key, expected: kind(default), found: kind(value) }),
-        }
-    }
-    Ok(())
-}
-
-fn kind(value: &Value) -> &'static str {
-    match value {
-        Value::String(_) => "a word in quotes",
-        Value::Integer(_) => "a whole number",
-        Value::Float(_) => "a number",
-        Value::Boolean(_) => "true or false",
-        Value::Datetime(_) => "a date",
-        Value::Array(_) => "a list",
-        Value::Table(_) => "a section",
-    }
-}
-
-/// Longest key that is compared with the known ones: comparing takes time in proportion to the length.
-const COMPARED_LEN_MAX: usize = 100;
-
-/// The known key that looks most like this one, if any does.
-fn closest(key: &str) -> Option<String> {
-    if key.len() > COMPARED_LEN_MAX {
-        return None;
-    }
-    let mut known = Vec::new();
-    if let Ok(defaults) = parse(include_str!("presets/all.toml"), "presets/all.toml") {
-        for (section, value) in &defaults {
-            known.push(section.clone());
-            if let Value::Table(keys) = value {
-                known.extend(keys.keys().map(|name| format!("{section}.{name}")));
-            }
-        }
-    }
-    // The last part alone is compared too: a key in the wrong section is a common slip.
-    let last = |key: &str| key.rsplit('.').next().map(str::to_owned).unwrap_or_default();
-    let likeness =
-        |known: &str| strsim::jaro_winkler(key, known).max(strsim::jaro_winkler(&last(key), &last(known)));
-    let best = known.into_iter().max_by(|a, b| likeness(a).total_cmp(&likeness(b)))?;
-    (likeness(&best) > 0.8).then_some(best)
 }
 
 fn task_set(typed: &Table) -> Result<TaskSet, ConfigError> {
@@ -428,7 +261,7 @@ mod tests {
     const MATRIX: &str = "environment.task_set = \"matrix-game\"";
 
     fn with(settings: &[&str]) -> Result<Config, ConfigError> {
-        let settings: Vec<Table> = settings.iter().map(|text| set(text).unwrap()).collect();
+        let settings: Vec<Table> = settings.iter().map(|text| set(text)).collect::<Result<_, _>>()?;
         resolve(MATRIX, "test", &settings)
     }
 
@@ -503,55 +336,203 @@ mod tests {
         assert_eq!(resolve(&text, "config.toml", &[]), Ok(config));
     }
 
+    /// Why these settings are refused, by `set` or by `resolve`.
+    fn refused(settings: &[&str]) -> String {
+        with(settings).unwrap_err().to_string()
+    }
+
+    /// Why an experiment's text is refused.
+    fn refused_file(text: &str) -> String {
+        resolve(text, "my.toml", &[]).unwrap_err().to_string()
+    }
+
     #[test]
     fn errors_name_the_key_and_the_remedy() {
-        let message = |settings: &[&str]| with(settings).unwrap_err().to_string();
-        assert_eq!(message(&["algorithm.gamma=7"]), "algorithm.gamma = 7 is out of range 0..=1");
-        assert_eq!(message(&["algorithm.gamma=nan"]), "algorithm.gamma = NaN is out of range 0..=1");
+        for (setting, message) in [
+            ("algorithm.gamma=7", "algorithm.gamma = 7 is out of range 0..=1"),
+            ("algorithm.gamma=nan", "algorithm.gamma = NaN is out of range 0..=1"),
+            ("algorithm.gamma=high", "algorithm.gamma must be a number, not \"high\""),
+            ("algorithm.lr=1e30", "algorithm.lr = 1e30 is out of range 1e-12..=1"),
+            ("algorithm.lr=1e-13", "algorithm.lr = 1e-13 is out of range 1e-12..=1"),
+            ("algorithm.rmsprop_alpha=1", "algorithm.rmsprop_alpha = 1 is out of range 0..=0.999999"),
+            ("algorithm.batch_size=-1", "algorithm.batch_size must be a whole number of at least 0, not -1"),
+            (
+                "algorithm.batch_size=32.0",
+                "algorithm.batch_size must be a whole number of at least 0, not 32.0; write 32",
+            ),
+            (
+                "algorithm.batch_size=many",
+                "algorithm.batch_size must be a whole number of at least 0, not \"many\"",
+            ),
+            ("algorithm.batch_size=6000", "algorithm.batch_size = 6000 is out of range 1..=5000"),
+            (
+                "algorithm.task_representations=no",
+                "algorithm.task_representations must be true or false, not \"no\"",
+            ),
+            (
+                "seed=18446744073709551615",
+                "seed = 18446744073709551615 is out of range 0..=9223372036854775807",
+            ),
+            ("training.t_max=1e30", "training.t_max = 1e30 is out of range 0..=9223372036854775807"),
+            ("training.t_max=2e12", "training.t_max = 2000000000000 is out of range 1..=1000000000000"),
+            (
+                "environment.approach_shaping=5",
+                "environment.approach_shaping means nothing to matrix-game; leave it out",
+            ),
+            (
+                "environment.view_radius=1",
+                "environment.view_radius means nothing to matrix-game; leave it out",
+            ),
+            ("network.n_heads=3", "attention_dim 64 is not a multiple of n_heads 3"),
+            ("algorithm.mixing=vdn", "algorithm.mixing must be \"network\" or \"sum\""),
+            (
+                "environment.spawn_rotate=x",
+                "environment.spawn_rotate = \"x\" is none of its choices: published, always, never",
+            ),
+            (
+                "algorithm.optimizer=sgd",
+                "algorithm.optimizer = \"sgd\" is none of its choices: rmsprop, adam",
+            ),
+            ("web.listen=8080", "web.listen = \"8080\"; write \"127.0.0.1:PORT\" or \"off\""),
+            (
+                "algorithm.gamma",
+                "--set \"algorithm.gamma\": write --set section.key=value, such as --set algorithm.lr=0.0005",
+            ),
+            (
+                "algorithm={gamma=0.5}",
+                "algorithm must be a section, not a value: set one of its keys, such as algorithm.batch_size",
+            ),
+        ] {
+            assert_eq!(refused(&[setting]), message, "{setting}");
+        }
         assert_eq!(
-            message(&["algorithm.gama=0.9"]),
-            "unknown key \"algorithm.gama\"; did you mean \"algorithm.gamma\"?"
+            refused(&["algorithm.name=refil", "algorithm.encoder=x"]),
+            "algorithm.encoder = \"x\" is none of its choices: within, beside"
         );
-        assert_eq!(message(&["gamma=0.9"]), "unknown key \"gamma\"; did you mean \"algorithm.gamma\"?");
-        assert_eq!(message(&["zzz.qqq=1"]), "unknown key \"zzz\"");
-        let endless = "gamma".repeat(1_000_000);
-        assert_eq!(message(&[&format!("{endless}=1")]), format!("unknown key \"{endless}\""));
-        assert_eq!(
-            message(&["algorithm.gamma=high"]),
-            "algorithm.gamma must be a number, not a word in quotes"
-        );
-        assert_eq!(
-            message(&["algorithm.batch_size=-1"]),
-            "algorithm.batch_size must be a whole number of at least 0, not a negative one"
-        );
-        assert_eq!(
-            message(&["algorithm.batch_size=6000"]),
-            "algorithm.batch_size = 6000 is out of range 1..=5000"
-        );
-        assert_eq!(
-            message(&["environment.approach_shaping=5"]),
-            "environment.approach_shaping means nothing to matrix-game; leave it out"
-        );
-        assert_eq!(
-            message(&["environment.view_radius=1"]),
-            "environment.view_radius means nothing to matrix-game; leave it out"
-        );
-        assert_eq!(message(&["network.n_heads=3"]), "attention_dim 64 is not a multiple of n_heads 3");
-        assert!(message(&["training.until=win_rate=2"]).contains("write win_rate=NUMBER"));
-        assert!(message(&["web.listen=0.0.0.0:8080"]).contains("ssh -L 8080:127.0.0.1:8080 THIS-MACHINE"));
-        assert!(message(&["web.listen=8080"]).contains("must be a word in quotes"));
-        assert!(message(&["web.listen=on"]).ends_with("write \"127.0.0.1:PORT\" or \"off\""));
-        assert_eq!(message(&["algorithm.mixing=vdn"]), "algorithm.mixing must be \"network\" or \"sum\"");
+        assert!(refused(&["training.until=win_rate=2"]).contains("write win_rate=NUMBER"));
+        assert!(refused(&["web.listen=0.0.0.0:8080"]).contains("ssh -L 8080:127.0.0.1:8080 THIS-MACHINE"));
         assert!(
-            message(&["environment.task_set=chess"])
+            refused(&["environment.task_set=chess"])
                 .contains("unknown task set \"chess\"; known: matrix-game")
         );
-        assert!(resolve("", "test", &[]).unwrap_err().to_string().contains("names no environment.task_set"));
-        assert!(
-            resolve("a = = b", "my.toml", &[]).unwrap_err().to_string().starts_with("my.toml is not TOML: ")
+        assert!(refused_file("").contains("names no environment.task_set"));
+    }
+
+    #[test]
+    fn a_key_that_is_not_there_gets_the_one_that_was_meant_or_those_there_are() {
+        for (setting, advice) in [
+            ("algorithm.gama=0.9", "unknown key \"algorithm.gama\"; did you mean algorithm.gamma?"),
+            ("gamma=0.9", "unknown key \"gamma\"; did you mean algorithm.gamma?"),
+            ("learner.gamma=0.9", "unknown key \"learner.gamma\"; did you mean algorithm.gamma?"),
+            (
+                "learner.device=cuda",
+                "unknown key \"learner.device\"; [learner] has listen, metrics_every_env_steps, shards, threads, \
+                 tls, token_file",
+            ),
+            ("zzz.qqq=1", "unknown key \"zzz.qqq\"; a key is one of actors, algorithm,"),
+            ("seed\n8=1", "unknown key \"seed\\n8\"; "),
+            ("=1", "--set \"=1\": write --set section.key=value"),
+        ] {
+            let message = refused(&[setting]);
+            assert!(message.starts_with(advice), "{message}");
+        }
+        let endless = "gamma".repeat(1_000_000);
+        let message = refused(&[&format!("{endless}=1")]);
+        assert!(message.len() < 400 && message.contains("gammagamma\"…"), "{message}");
+        assert_eq!(key_like("lr").as_deref(), Some("algorithm.lr"));
+        assert_eq!(key_like("batch-size").as_deref(), Some("algorithm.batch_size"));
+        assert_eq!(key_like("zzz"), None);
+    }
+
+    #[test]
+    fn one_setting_sets_one_key() {
+        assert_eq!(
+            refused(&["training.t_max=6\nseed=9"]),
+            "training.t_max must be a whole number of at least 0, not \"6\\nseed=9\""
         );
-        assert!(set("algorithm.gamma").unwrap_err().to_string().contains("section.key=value"));
-        let two_lines = set("seed\n8").unwrap_err().to_string();
-        assert_eq!(two_lines, "--set seed 8 is not TOML: write --set section.key=value");
+        let message = refused(&["training.until=mean_return=1\nseed=9"]);
+        assert!(message.contains("\"mean_return=1\\nseed=9\""), "{message}");
+        let quoted = set("learner.token_file=\"a b\"").unwrap();
+        assert_eq!(quoted, set("learner.token_file=a b").unwrap());
+        assert_eq!(quoted["learner"]["token_file"].as_str(), Some("a b"));
+    }
+
+    #[test]
+    fn a_list_is_written_as_in_toml_or_with_commas() {
+        for text in ["[\"game-1\", \"game-4\"]", "game-1,game-4", "game-1, game-4"] {
+            let config = with(&[&format!("environment.training_tasks={text}")]).unwrap();
+            assert_eq!(config.environment.training_tasks, ["game-1", "game-4"], "{text}");
+        }
+        assert!(refused(&["environment.training_tasks=[1"]).contains("must be a list, not \"[1\""));
+        assert!(refused(&["environment.training_tasks=game-9"]).starts_with("environment.training_tasks: "));
+    }
+
+    #[test]
+    fn counts_may_be_written_short() {
+        for text in ["1e6", "1000k", "1M", "1_000_000", "1000000"] {
+            let config = with(&[&format!("training.t_max={text}")]).unwrap();
+            assert_eq!(config.training.t_max, 1_000_000, "{text}");
+        }
+        let largest = with(&["seed=9223372036854775807"]).unwrap();
+        assert_eq!(largest.seed.0, 9_223_372_036_854_775_807);
+        assert_eq!(resolve(&largest.to_toml().unwrap(), "config.toml", &[]), Ok(largest));
+        assert_eq!(with(&["algorithm.grad_norm_clip=1k"]).unwrap().algorithm.grad_norm_clip, 1000.0);
+    }
+
+    #[test]
+    fn a_bound_is_within_its_bounds_and_leads_back() {
+        for setting in [
+            "algorithm.lr=1e-12",
+            "algorithm.lr=1",
+            "algorithm.optimizer_eps=1e-12",
+            "algorithm.rmsprop_alpha=0.999999",
+        ] {
+            let config = with(&[setting]).unwrap();
+            assert_eq!(resolve(&config.to_toml().unwrap(), "config.toml", &[]), Ok(config), "{setting}");
+        }
+        let text = with(&["algorithm.lr=0.001", "algorithm.gamma=0.9"]).unwrap().to_toml().unwrap();
+        assert!(text.contains("lr = 0.001\n") && text.contains("gamma = 0.9\n"), "{text}");
+    }
+
+    #[test]
+    fn an_end_that_no_task_reaches_is_refused() {
+        assert!(with(&["training.until=win_rate=0.5"]).is_ok());
+        for name in ["cooperative-navigation", "predator-prey", "predator-prey-pro"] {
+            let text = format!("environment.task_set = {name:?}\ntraining.until = \"win_rate=0.5\"");
+            assert_eq!(
+                refused_file(&text),
+                format!(
+                    "training.until = \"win_rate=0.5\": the tasks of {name} know no winning, so that is never \
+                     reached; write mean_return=NUMBER"
+                )
+            );
+        }
+    }
+
+    #[test]
+    fn what_is_no_toml_is_said_with_its_place() {
+        for (text, place) in [
+            ("a = = b", "my.toml, line 1, column 5: "),
+            ("seed = 1\n\n# ä\n\"ä\" = x\n", "my.toml, line 4, column 7: "),
+            ("seed = 1\nseed = 2\n", "my.toml, line 2, column 1: "),
+            ("seed = 18446744073709551615\n", "my.toml, line 1, column 8: "),
+        ] {
+            let message = refused_file(text);
+            assert!(message.starts_with(place), "{message}");
+        }
+        for text in ["a = = b", "seed = 1\nseed = 2", "[a\n]", "a = '''\nb"] {
+            assert!(!refused_file(text).contains('\n'), "one line: {}", refused_file(text));
+        }
+    }
+
+    #[test]
+    fn a_file_has_whole_numbers_written_as_such() {
+        let refused = |value: &str| refused_file(&format!("{MATRIX}\ntraining.t_max = {value}"));
+        let must = "training.t_max must be a whole number of at least 0, not ";
+        assert_eq!(refused("1e6"), format!("{must}1000000.0; write 1000000"));
+        assert_eq!(refused("0.5"), format!("{must}0.5"));
+        assert_eq!(refused("\"5\""), format!("{must}\"5\""));
+        assert_eq!(refused("[5]"), format!("{must}a list"));
+        assert_eq!(refused_file(&format!("algorithm = 5\n{MATRIX}")), "algorithm must be a section, not 5");
     }
 }
