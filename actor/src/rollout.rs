@@ -14,7 +14,10 @@ use rit_episode::{
     Episode,
     wire::{self, EncodeError, Frame, PayloadLayout, RunId},
 };
-use rit_proto::v1::{Lease, Snapshot};
+use rit_proto::{
+    transport::status_words,
+    v1::{Lease, Snapshot},
+};
 use std::sync::{
     Arc,
     atomic::{AtomicBool, Ordering},
@@ -50,7 +53,7 @@ impl Failures {
 #[derive(Debug, thiserror::Error)]
 pub enum RolloutError {
     /// The weights a lease asks for cannot be had.
-    #[error("no weights from the learner: {0}")]
+    #[error("no weights from the learner: {}", status_words(.0))]
     Weights(#[from] tonic::Status),
     /// Weights of another model.
     #[error(

@@ -10,7 +10,7 @@ use rit_config::{Config, RunDir, resolve};
 use rit_episode::wire::{self, PayloadLayout};
 use rit_ipc::{EpisodeSender, OpenError, RunSpace, RunSpaceError};
 use rit_proto::{
-    transport::{self, Address, AddressError, ConnectError, Credentials},
+    transport::{self, Address, AddressError, ConnectError, Credentials, status_words},
     v1::{
         ActorMessage, Done, Heartbeat, Hello, LearnerMessage, Lease, Leaving, Welcome, actor_message,
         learner_message, rollout_client::RolloutClient,
@@ -354,7 +354,7 @@ fn refusal(status: &tonic::Status) -> ActorError {
         | Code::Cancelled
         | Code::Unknown
         | Code::ResourceExhausted
-        | Code::DeadlineExceeded => ActorError::LearnerGone(status.message().to_owned()),
-        _ => ActorError::Refused(status.message().to_owned()),
+        | Code::DeadlineExceeded => ActorError::LearnerGone(status_words(status)),
+        _ => ActorError::Refused(status_words(status)),
     }
 }

@@ -35,7 +35,7 @@ const REAP_PATIENCE: Duration = Duration::from_secs(1);
 
 /// Something in iceoryx2 that has no better name here.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{doing} failed, iceoryx2 says {reason}: run with IOX2_LOG_LEVEL=debug to see why")]
+#[error("shared memory: {doing} failed: {reason}; IOX2_LOG_LEVEL=debug says more")]
 pub struct IceoryxError {
     doing: &'static str,
     reason: String,
@@ -43,8 +43,22 @@ pub struct IceoryxError {
 
 impl IceoryxError {
     pub(crate) fn new(doing: &'static str, reason: impl Debug) -> Self {
-        Self { doing, reason: format!("{reason:?}") }
+        Self { doing, reason: in_words(&format!("{reason:?}")) }
     }
+}
+
+/// The name of an error of iceoryx2 as words: `InsufficientPermissions` is "insufficient permissions".
+fn in_words(name: &str) -> String {
+    let mut words = String::new();
+    let mut before = ' ';
+    for c in name.chars() {
+        if c.is_ascii_uppercase() && before.is_ascii_lowercase() {
+            words.push(' ');
+        }
+        before = c;
+        words.push(c.to_ascii_lowercase());
+    }
+    words
 }
 
 /// Whose node it is: the reaper tells them apart.

@@ -4,6 +4,7 @@ use super::{
     ALPN_HTTP2, Address, CALL_TIMEOUT, CONNECT_TIMEOUT, KEEPALIVE_EVERY, KEEPALIVE_TIMEOUT,
     LONG_CALL_TIMEOUT,
     files::{FileError, read_authorities, read_certificates, read_key, read_token},
+    words,
 };
 use hyper_util::rt::TokioIo;
 use std::{error::Error, fmt, io, path::PathBuf, sync::Arc, time::Duration};
@@ -283,7 +284,9 @@ fn why(address: &Address, error: &(dyn Error + 'static)) -> ConnectError {
         }
         cause = error.source();
     }
-    ConnectError::NoAnswer { address, reason: innermost(error) }
+    let reason = innermost(error);
+    let reason = if words::is_of_a_library(&reason) { "the connection broke".to_owned() } else { reason };
+    ConnectError::NoAnswer { address, reason }
 }
 
 /// The cause at the end of a chain of errors: what a person can act on.

@@ -18,6 +18,7 @@ mod listen;
 mod serve;
 #[cfg(test)]
 mod tests;
+mod words;
 
 pub use access::{Access, AccessError, AccessFiles, is_secret};
 pub use address::{Address, AddressError};
@@ -25,6 +26,7 @@ pub use connect::{Client, ConnectError, CredentialFiles, Credentials, Credential
 pub use files::{FileError, check_private};
 pub use listen::{Incoming, ListenError};
 pub use serve::{CONNECTIONS_MAX, REQUEST_BYTES_MAX, ServeLimits, serve};
+pub use words::status_words;
 
 use std::time::Duration;
 
