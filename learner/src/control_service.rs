@@ -153,7 +153,7 @@ impl From<AskError> for Status {
         match error {
             AskError::Over => Self::unavailable(message),
             AskError::Task(_)
-            | AskError::NoTasks(_)
+            | AskError::Tasks(_)
             | AskError::Episodes(_)
             | AskError::Setting(_)
             | AskError::Log(_) => Self::invalid_argument(message),

@@ -67,6 +67,22 @@ pub fn in_words(results: &[TaskResult]) -> String {
     words.collect::<Vec<_>>().join(", ")
 }
 
+/// Why there is nothing to evaluate.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum TasksError {
+    /// No such task.
+    #[error(transparent)]
+    Unknown(#[from] TaskError),
+    /// A task set without tasks that are kept for testing.
+    #[error("{task_set} has no testing tasks; write training, or names of its tasks: {}", known.join(", "))]
+    NoTesting {
+        /// The task set.
+        task_set: TaskSet,
+        /// Its tasks.
+        known: Vec<String>,
+    },
+}
+
 /// What all evaluations of a run share.
 #[derive(Clone, Debug)]
 pub struct Evaluator {
@@ -75,6 +91,8 @@ pub struct Evaluator {
     tasks: [Vec<Task>; 2],
     options: EnvironmentOptions,
     random_permutation: bool,
+    episodes: usize,
+    testing_episodes: usize,
 }
 
 impl Evaluator {
@@ -85,14 +103,23 @@ impl Evaluator {
             tasks: [Split::Training, Split::Testing].map(|split| config.tasks(split)),
             options: config.environment_options(),
             random_permutation: config.algorithm.random_permutation,
+            episodes: config.evaluation.episodes,
+            testing_episodes: config.evaluation.testing_episodes,
         }
+    }
+
+    /// Greedy episodes of a task where nobody asks for another number: `evaluation.testing_episodes` of a testing task,
+    /// `evaluation.episodes` of the others.
+    pub fn own_episodes(&self, task: Task) -> usize {
+        let is_testing = self.tasks[1].contains(&task);
+        if is_testing { self.testing_episodes } else { self.episodes }
     }
 
     /// The tasks of `training`, `testing`, or of names of tasks; the training tasks where nothing is named.
     ///
     /// # Errors
-    /// When a name means nothing.
-    pub fn tasks(&self, names: &[String]) -> Result<Vec<Task>, TaskError> {
+    /// When a name means nothing, or there are no testing tasks.
+    pub fn tasks(&self, names: &[String]) -> Result<Vec<Task>, TasksError> {
         let [training, testing] = &self.tasks;
         if names.is_empty() {
             return Ok(training.clone());
@@ -101,11 +128,34 @@ impl Evaluator {
         for name in names {
             match name.as_str() {
                 "training" => tasks.extend(training),
+                "testing" if testing.is_empty() => {
+                    let known = training.iter().map(Task::to_string).collect();
+                    return Err(TasksError::NoTesting { task_set: self.task_set, known });
+                }
                 "testing" => tasks.extend(testing),
                 name => tasks.push(self.task_set.task(name)?),
             }
         }
         Ok(tasks)
+    }
+
+    /// Rolls greedy episodes of each task, so many of each as are asked for or as the run has of its own.
+    ///
+    /// # Errors
+    /// When an environment cannot go on.
+    pub fn evaluate_own(
+        &self,
+        policy: &mut dyn Policy,
+        tasks: &[Task],
+        asked: Option<usize>,
+        seed: RunSeed,
+    ) -> Result<Vec<TaskResult>, LostEpisode> {
+        let mut results = Vec::with_capacity(tasks.len());
+        for &task in tasks {
+            let episodes = asked.unwrap_or_else(|| self.own_episodes(task));
+            results.extend(self.evaluate(policy, &[task], episodes, seed)?);
+        }
+        Ok(results)
     }
 
     /// Rolls so many greedy episodes of each task. The same seed rolls the same episodes.
@@ -202,11 +252,33 @@ mod tests {
             results.iter().map(|r| (r.task.as_str(), r.episodes, r.mean_return, r.win_rate)).collect();
         assert_eq!(facts, [("game-4", 70, 106.0, Some(1.0)), ("game-2", 70, -18.0, Some(0.0))]);
         assert_eq!(evaluator.tasks(&[]).unwrap().len(), 4);
-        assert!(evaluator.tasks(&["testing".into()]).unwrap().is_empty());
+        let none = evaluator.tasks(&["testing".into()]).unwrap_err().to_string();
+        assert!(none.starts_with("matrix-game has no testing tasks; write training, or names of"), "{none}");
         assert!(
             evaluator.tasks(&["game-5".into()]).unwrap_err().to_string().contains("known: game-1, game-2")
         );
     }
+
+    #[test]
+    fn a_testing_task_has_a_number_of_episodes_of_its_own() {
+        let settings = ["evaluation.episodes=2", "evaluation.testing_episodes=3"];
+        let settings: Vec<_> = settings.iter().map(|text| rit_config::set(text).unwrap()).collect();
+        let text = "environment.task_set = \"predator-prey\"";
+        let evaluator = Evaluator::new(&rit_config::resolve(text, "test", &settings).unwrap());
+        let tasks = evaluator.tasks(&["training".into(), "testing".into()]).unwrap();
+        let counts = |asked| {
+            let results = evaluator.evaluate_own(&mut Script::Still, &tasks, asked, RunSeed(1)).unwrap();
+            results.iter().map(|result| result.episodes).collect::<Vec<_>>()
+        };
+        let (training, testing) = (
+            counts(None).iter().filter(|&&n| n == 2).count(),
+            counts(None).iter().filter(|&&n| n == 3).count(),
+        );
+        assert_eq!(training, evaluator.tasks(&[]).unwrap().len());
+        assert_eq!((training + testing, testing > 0), (tasks.len(), true));
+        assert_eq!(counts(Some(1)), vec![1; tasks.len()]);
+    }
+
     #[test]
     fn whoever_watches_sees_the_episodes_that_are_measured() {
         let config = rit_config::resolve("environment.task_set = \"predator-prey\"", "test", &[]).unwrap();

@@ -2,13 +2,13 @@
 
 use crate::{
     coordinator::{Control, Event},
-    evaluation::{Evaluator, TaskResult},
+    evaluation::{Evaluator, TaskResult, TasksError},
     trainer::{Checkpointed, evaluation_seed},
     weights::{Snapshot, WeightsBoard},
 };
 use rit_algo::{Acting, Model};
 use rit_config::{Config, ConfigError, RunDir, RunDirError, set, set_live};
-use rit_env::{Scene, TaskError, TaskSet, rollout::LostEpisode};
+use rit_env::{Scene, TaskError, rollout::LostEpisode};
 use rit_episode::{Episode, RunSeed};
 use rit_proto::v1;
 use std::sync::Arc;
@@ -32,12 +32,12 @@ pub enum AskError {
     /// No such task.
     #[error(transparent)]
     Task(#[from] TaskError),
+    /// No such tasks.
+    #[error(transparent)]
+    Tasks(#[from] TasksError),
     /// An environment could not go on.
     #[error(transparent)]
     Lost(#[from] LostEpisode),
-    /// A split without tasks.
-    #[error("{0} has no such tasks")]
-    NoTasks(TaskSet),
     /// More episodes than anybody would wait for.
     #[error("{0} episodes of a task are too many: at most {EPISODES_MAX}")]
     Episodes(u32),
@@ -169,17 +169,14 @@ impl RunHandle {
         let config = self.config();
         let evaluator = Evaluator::new(&config);
         let tasks = evaluator.tasks(&tasks)?;
-        if tasks.is_empty() {
-            return Err(AskError::NoTasks(config.environment.task_set));
-        }
         let episodes = match episodes {
-            0 => config.evaluation.episodes,
-            1..=EPISODES_MAX => episodes as usize,
+            0 => None,
+            1..=EPISODES_MAX => Some(episodes as usize),
             _ => return Err(AskError::Episodes(episodes)),
         };
         let seed = seed.map_or_else(|| evaluation_seed(&config), RunSeed);
         self.roll(move |acting, snapshot| {
-            let results = evaluator.evaluate(acting, &tasks, episodes, seed)?;
+            let results = evaluator.evaluate_own(acting, &tasks, episodes, seed)?;
             Ok(v1::Evaluation {
                 env_steps: snapshot.env_steps,
                 weights_version: snapshot.version,

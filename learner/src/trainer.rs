@@ -116,14 +116,16 @@ pub enum TrainError {
     State(#[from] StateError),
     /// An update that would make weights that are no numbers.
     #[error(
-        "{error} in update {update}; no weight has taken it over, and the newest checkpoint is whole: a smaller \
-         algorithm.lr or algorithm.grad_norm_clip may help"
+        "{error} in update {update}: training has diverged, and would again from its checkpoints, whose weights are \
+         whole; start a new run with a smaller algorithm.lr or algorithm.grad_norm_clip, such as --set algorithm.lr={lr:.0e}"
     )]
     NotFinite {
         /// Its number, from 1.
         update: u64,
         /// What is not finite.
         error: NotFinite,
+        /// A learning rate that may do better.
+        lr: f32,
     },
 }
 
@@ -332,8 +334,11 @@ impl Trainer {
         if let Some(batch) = batch {
             let learned = self.learner.learn(&batch, draw);
             progress.updates += 1;
-            let values =
-                learned.map_err(|error| TrainError::NotFinite { update: progress.updates, error })?;
+            let values = learned.map_err(|error| TrainError::NotFinite {
+                update: progress.updates,
+                error,
+                lr: algorithm.lr / 10.0,
+            })?;
             self.standing.measured = Measured::new(self.learner.measures(), &values);
             if progress.episodes - self.target_copied_at >= algorithm.target_update_interval {
                 self.learner.update_target();

@@ -75,7 +75,7 @@ impl IntoResponse for ApiError {
             Self::Ask(AskError::Over) => StatusCode::SERVICE_UNAVAILABLE,
             Self::Ask(
                 AskError::Task(_)
-                | AskError::NoTasks(_)
+                | AskError::Tasks(_)
                 | AskError::Episodes(_)
                 | AskError::Setting(_)
                 | AskError::Log(_),
@@ -102,6 +102,7 @@ struct Run {
     /// Whether episodes can be drawn.
     has_scenes: bool,
     evaluation_episodes: usize,
+    testing_episodes: usize,
     config: String,
 }
 
@@ -119,6 +120,7 @@ async fn run(State(page): State<Page>) -> Result<Json<Run>, ApiError> {
         has_wins: task_set.has_wins(),
         has_scenes: config.tasks(Split::Training).iter().all(|task| task.spec().has_scenes),
         evaluation_episodes: config.evaluation.episodes,
+        testing_episodes: config.evaluation.testing_episodes,
         config: fs::read_to_string(page.run_dir.config_path())?,
     }))
 }

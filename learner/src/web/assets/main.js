@@ -127,7 +127,13 @@ function setUpEvaluate() {
     ...(run.testing_tasks.length ? [option("testing", "all testing tasks")] : []),
     ...[...run.training_tasks, ...run.testing_tasks].map((name) => option(name)),
   );
-  byId("evaluate-episodes").value = run.evaluation_episodes;
+  const own = () => {
+    const task = byId("evaluate-tasks").value;
+    const testing = task === "testing" || run.testing_tasks.includes(task);
+    byId("evaluate-episodes").value = testing ? run.testing_episodes : run.evaluation_episodes;
+  };
+  byId("evaluate-tasks").addEventListener("change", own);
+  own();
   onClick("evaluate", () => byId("evaluate-dialog").showModal());
   onClick("evaluate-close", () => byId("evaluate-dialog").close());
   onClick("evaluate-go", async () => {
