@@ -1,6 +1,6 @@
 //! `rit certificates`: an authority of one's own, for people without one.
 
-use crate::{cli::CertificatesOptions, failure::Failure};
+use crate::{cli::CertificatesOptions, failure::Failure, output};
 use rcgen::{
     BasicConstraints, CertificateParams, CertifiedIssuer, DnType, ExtendedKeyUsagePurpose, IsCa, KeyPair,
     KeyUsagePurpose,
@@ -17,7 +17,6 @@ use std::{
 const DAY: Duration = Duration::from_secs(24 * 60 * 60);
 
 /// `rit certificates`.
-#[allow(clippy::print_stdout, reason = "what the command is for")]
 pub fn run(options: &CertificatesOptions) -> Result<ExitCode, Failure> {
     let out = &options.out;
     let io = |error| Failure::input_message(format!("{}: {error}", out.display()));
@@ -43,7 +42,7 @@ pub fn run(options: &CertificatesOptions) -> Result<ExitCode, Failure> {
         write(&out, &format!("{name}.key"), 0o600, &key.serialize_pem())?;
     }
     let out = out.display();
-    print!(
+    output::print(&format!(
         "the learner, in its experiment or with --set:\n\
          [learner.tls]\n\
          certificate = \"{out}/learner.pem\"\n\
@@ -54,7 +53,7 @@ pub fn run(options: &CertificatesOptions) -> Result<ExitCode, Failure> {
          --tls-ca {out}/ca.pem --tls-certificate {out}/client.pem --tls-key {out}/client.key\n\
          \n\
          {out}/ca.key can make further certificates; keep it where nobody else gets at it, or delete it.\n"
-    );
+    ))?;
     Ok(ExitCode::SUCCESS)
 }
 

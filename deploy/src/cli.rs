@@ -1,10 +1,11 @@
 //! What can be typed.
 
 use crate::logging::LogOptions;
-use clap::{Args, Parser, Subcommand, ValueEnum, builder::TypedValueParser as _};
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use rit_config::{WHOLE_MAX, count};
 use rit_learner::run_handle::EPISODES_MAX;
 use rit_proto::transport::{Address, CredentialFiles, Credentials, CredentialsError};
-use std::{fmt, path::PathBuf};
+use std::{fmt, net::IpAddr, path::PathBuf};
 
 /// Multi-task multi-agent reinforcement learning with interaction and task representations.
 #[derive(Debug, Parser)]
@@ -63,13 +64,13 @@ pub struct ConfigOptions {
     #[arg(long, value_name = "NAME")]
     pub algorithm: Option<String>,
     /// The run's seed: the same seed gives the same weights
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = count)]
     pub seed: Option<u64>,
     /// Actor processes
-    #[arg(long, value_name = "N")]
-    pub actors: Option<u32>,
-    /// Environment steps to collect, `training.t_max`
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = count)]
+    pub actors: Option<u64>,
+    /// Environment steps to collect, `training.t_max`: 1000000, 1_000_000, 1e6 or 1M
+    #[arg(long, value_name = "N", value_parser = count)]
     pub steps: Option<u64>,
     /// End at the first evaluation where every training task has reached this, such as win_rate=1.0
     #[arg(long, value_name = "METRIC=VALUE")]
@@ -171,10 +172,10 @@ pub struct CertificatesOptions {
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
     /// Names and IP addresses by which callers reach the learner
-    #[arg(long = "host", value_name = "NAME", required = true, num_args = 1..)]
+    #[arg(long = "host", value_name = "NAME", required = true, num_args = 1.., value_parser = host)]
     pub hosts: Vec<String>,
     /// Days that they are valid for
-    #[arg(long, value_name = "N", default_value_t = 365, value_parser = clap::value_parser!(u32).range(1..=3650))]
+    #[arg(long, value_name = "N", default_value_t = 365, value_parser = within::<u32>(1, 3650))]
     pub days: u32,
 }
 
@@ -199,11 +200,12 @@ pub struct EvaluateOptions {
     /// training, testing, or names of tasks
     #[arg(long, value_delimiter = ',', default_value = "training")]
     pub tasks: Vec<String>,
-    /// Episodes of each task; without it the run's own number
-    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=i64::from(EPISODES_MAX)))]
+    /// Episodes of each task; without it the run's own number: evaluation.episodes of a training task,
+    /// evaluation.testing_episodes of a testing task
+    #[arg(long, value_parser = within::<u32>(1, EPISODES_MAX.into()))]
     pub episodes: Option<u32>,
     /// Seed of the evaluation; without it one that follows from the run's
-    #[arg(long)]
+    #[arg(long, value_parser = count)]
     pub seed: Option<u64>,
     /// Print JSON
     #[arg(long)]
@@ -223,10 +225,10 @@ pub struct RenderOptions {
     #[arg(long)]
     pub task: String,
     /// Episodes to draw
-    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=20))]
+    #[arg(long, default_value_t = 1, value_parser = within::<u8>(1, 20))]
     pub episodes: u8,
     /// Seed of the episodes; without it one that follows from the run's
-    #[arg(long)]
+    #[arg(long, value_parser = count)]
     pub seed: Option<u64>,
     /// File to write, ending in .gif, .png or .svg
     #[arg(long, value_name = "FILE")]
@@ -245,16 +247,16 @@ pub struct SoakOptions {
     #[arg(long, value_name = "NAME")]
     pub algorithm: Option<String>,
     /// Kills, spread over the run
-    #[arg(long, default_value_t = 10, value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..=100_000))]
+    #[arg(long, default_value_t = 10, value_parser = within::<usize>(1, 100_000))]
     pub kills: usize,
     /// Seed of both runs, and of the moments and victims
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 1, value_parser = count)]
     pub seed: u64,
     /// Actor processes
-    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=64))]
+    #[arg(long, default_value_t = 2, value_parser = within::<u32>(1, 64))]
     pub actors: u32,
     /// Environment steps of each run; without it the experiment's own number
-    #[arg(long)]
+    #[arg(long, value_parser = count)]
     pub steps: Option<u64>,
     /// Set any key of both runs; may be given again and again
     #[arg(long = "set", value_name = "KEY=VALUE")]
@@ -268,19 +270,46 @@ pub struct SoakOptions {
 }
 
 #[derive(Args, Debug)]
+#[command(after_help = "\
+Runs of one experiment with other seeds are drawn together: a line for the mean of each task, a band from the lowest to \
+the highest. Runs that differ in more than the seed are refused, unless --compare asks for a line for each kind of \
+them, its mean over all tasks.")]
 pub struct PlotOptions {
-    /// Run directories, or files like their metrics.jsonl; several runs give a mean and the span from lowest to highest
+    /// Run directories, or files like their metrics.jsonl
     #[arg(required = true)]
     pub runs: Vec<PathBuf>,
     /// File to write, ending in .svg
     #[arg(long, value_name = "FILE")]
     pub out: PathBuf,
+    /// Write over the file if it is there
+    #[arg(long)]
+    pub force: bool,
+    /// What is drawn
+    #[arg(long, value_enum, default_value_t = PlotMetric::MeanReturn)]
+    pub metric: PlotMetric,
+    /// Draw a line for each kind of runs, told apart by what their configurations differ in
+    #[arg(long)]
+    pub compare: bool,
+    /// What a kind of runs is called, in the order in which they are given; for --compare
+    #[arg(long = "label", value_name = "TEXT", requires = "compare")]
+    pub labels: Vec<String>,
     /// Heading
     #[arg(long, default_value = "Greedy evaluation of the training tasks")]
     pub title: String,
-    /// Draw a dashed line at this return, for comparison
-    #[arg(long, value_name = "RETURN", allow_negative_numbers = true)]
+    /// Draw a dashed line at this value, for comparison
+    #[arg(long, value_name = "VALUE", allow_negative_numbers = true, value_parser = finite)]
     pub line: Option<f64>,
+}
+
+/// What of an evaluation is drawn.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum PlotMetric {
+    /// Mean of undiscounted returns.
+    #[value(name = "return", alias = "mean_return")]
+    MeanReturn,
+    /// Share of episodes won.
+    #[value(name = "win_rate", alias = "win-rate")]
+    WinRate,
 }
 
 #[derive(Args, Debug)]
@@ -311,7 +340,7 @@ pub struct BenchOptions {
     #[arg(long, default_value_t = 5.0, value_parser = positive)]
     pub seconds: f64,
     /// Payload of a frame, for ipc
-    #[arg(long, default_value_t = 64, value_parser = clap::value_parser!(u16).range(1..=16384).map(usize::from))]
+    #[arg(long, default_value_t = 64, value_parser = within::<usize>(1, 16384))]
     pub payload_kib: usize,
     /// Print JSON
     #[arg(long)]
@@ -345,11 +374,48 @@ impl fmt::Display for BenchKind {
 }
 
 fn positive(text: &str) -> Result<f64, String> {
-    let seconds: f64 = text.parse().map_err(|error| format!("{error}"))?;
+    let seconds = finite(text)?;
     if (0.0..=3600.0).contains(&seconds) && seconds > 0.0 {
         Ok(seconds)
     } else {
-        Err("must lie in 0..=3600".into())
+        Err("it must lie above 0 and up to 3600".into())
+    }
+}
+
+fn finite(text: &str) -> Result<f64, String> {
+    let number = text.trim().parse().ok().filter(|number: &f64| number.is_finite());
+    number.ok_or_else(|| "write a number, such as -12.5".to_owned())
+}
+
+/// Reads a count in this range.
+fn within<T: TryFrom<u64>>(min: u64, max: u64) -> impl Fn(&str) -> Result<T, String> + Clone {
+    move |text| {
+        let out_of_range = || format!("it is out of range {min}..={}", max.min(WHOLE_MAX));
+        let number = match count(text) {
+            Err(rit_config::CountError::TooLarge) => return Err(out_of_range()),
+            number => number.map_err(|error| error.to_string())?,
+        };
+        if !(min..=max).contains(&number) {
+            return Err(out_of_range());
+        }
+        T::try_from(number).map_err(|_| out_of_range())
+    }
+}
+
+/// A name or address that a certificate can be for: what a DNS name may be, or an IP address.
+fn host(text: &str) -> Result<String, String> {
+    let is_label = |label: &str| {
+        let inner = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
+        (1..=63).contains(&label.len())
+            && label.chars().all(inner)
+            && !label.starts_with('-')
+            && !label.ends_with('-')
+    };
+    let name = text.strip_prefix("*.").unwrap_or(text);
+    if text.parse::<IpAddr>().is_ok() || (name.len() <= 253 && name.split('.').all(is_label)) {
+        Ok(text.to_owned())
+    } else {
+        Err("write a host's name or IP address, such as learner.example.org or 10.0.0.1".to_owned())
     }
 }
 
@@ -384,10 +450,10 @@ pub enum CtlCommand {
         #[arg(long, value_delimiter = ',', default_value = "training")]
         tasks: Vec<String>,
         /// Episodes of each task; without it the run's own number
-        #[arg(long, value_parser = clap::value_parser!(u32).range(1..=i64::from(EPISODES_MAX)))]
+        #[arg(long, value_parser = within::<u32>(1, EPISODES_MAX.into()))]
         episodes: Option<u32>,
         /// Seed of the evaluation; without it one that follows from the run's
-        #[arg(long)]
+        #[arg(long, value_parser = count)]
         seed: Option<u64>,
     },
     /// Write a checkpoint now
@@ -398,7 +464,7 @@ pub enum CtlCommand {
         #[arg(long)]
         follow: bool,
         /// Begin with the first line at or behind so many environment steps
-        #[arg(long, value_name = "STEPS", default_value_t = 0)]
+        #[arg(long, value_name = "STEPS", default_value_t = 0, value_parser = count)]
         from: u64,
     },
     /// Print the address of the run's web page; it carries the run's token

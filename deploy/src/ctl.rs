@@ -2,27 +2,27 @@
 
 use crate::{
     cli::{CtlCommand, CtlOptions},
-    control,
+    control::{self, Reached},
     failure::Failure,
+    finished::{self, Finished},
+    output::{self, Reader},
     report,
 };
 use rit_config::RunDir;
 use rit_proto::{
     transport::{self, Client},
     v1::{
-        CheckpointRequest, EvaluateRequest, Evaluation, MetricsRequest, PauseRequest, ResumeRequest,
-        RunStatus, SetRequest, StatusRequest, StopRequest, control_client::ControlClient,
+        CheckpointRequest, EvaluateRequest, Evaluation, MetricsLine, MetricsRequest, PauseRequest,
+        ResumeRequest, RunStatus, SetRequest, StatusRequest, StopRequest, control_client::ControlClient,
         metrics_update::Update,
     },
 };
 use std::{
-    io::{self, Write as _},
     path::{Path, PathBuf},
     process::ExitCode,
 };
 
 /// `rit ctl`.
-#[allow(clippy::print_stdout, reason = "what the command is for")]
 pub async fn run(options: CtlOptions) -> Result<ExitCode, Failure> {
     let (mut control, root) = match (options.address, options.run) {
         (Some(address), _) => {
@@ -32,7 +32,12 @@ pub async fn run(options: CtlOptions) -> Result<ExitCode, Failure> {
         }
         (None, Some(run)) => {
             let (run_dir, _) = RunDir::open(&run)?;
-            (control::connect(&run_dir).await?, run_dir.root().to_owned())
+            match control::reach(&run_dir).await? {
+                Reached::Learner(control) => (control, run_dir.root().to_owned()),
+                Reached::Over(finished) => {
+                    return over(&run_dir, &finished, &options.command, options.json);
+                }
+            }
         }
         (None, None) => return Err(Failure::input_message("which run? give --run DIR or --address ADDRESS")),
     };
@@ -67,7 +72,31 @@ pub async fn run(options: CtlOptions) -> Result<ExitCode, Failure> {
         }
         CtlCommand::Web => web(&root, options.json)?,
     };
-    print!("{text}");
+    output::print(&text)?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// What can be asked of a run that is over, from its run directory.
+fn over(
+    run_dir: &RunDir,
+    finished: &Finished,
+    command: &CtlCommand,
+    as_json: bool,
+) -> Result<ExitCode, Failure> {
+    match command {
+        CtlCommand::Status => {
+            output::print(&if as_json { finished.status_json() } else { finished.status_text() })?;
+        }
+        CtlCommand::Metrics { from, .. } => {
+            for line in finished::metrics(run_dir, *from)? {
+                if print_line(&line.to_message(), as_json)? == Reader::Gone {
+                    break;
+                }
+            }
+        }
+        CtlCommand::Web => return Err(finished.no_page()),
+        _ => return Err(finished.refusal()),
+    }
     Ok(ExitCode::SUCCESS)
 }
 
@@ -97,16 +126,17 @@ async fn metrics(
     let mut updates = control.metrics(request).await?.into_inner();
     while let Some(update) = updates.message().await? {
         let Some(Update::Line(line)) = update.update else { continue };
-        let text = if as_json {
-            serde_json::to_string(&line).map_err(Failure::runtime)?
-        } else {
-            report::line(&line)
-        };
-        if writeln!(io::stdout(), "{text}").is_err() {
+        if print_line(&line, as_json)? == Reader::Gone {
             return Ok(());
         }
     }
     Ok(())
+}
+
+fn print_line(line: &MetricsLine, as_json: bool) -> Result<Reader, Failure> {
+    let text =
+        if as_json { serde_json::to_string(line).map_err(Failure::runtime)? } else { report::line(line) };
+    output::print(&(text + "\n"))
 }
 
 fn web(root: &Path, as_json: bool) -> Result<String, Failure> {

@@ -1,6 +1,6 @@
 //! The experiments that come with the program, and a person's own.
 
-use crate::{cli::ConfigOptions, failure::Failure};
+use crate::{cli::ConfigOptions, failure::Failure, output};
 use rit_algo::Method;
 use rit_config::{Config, resolve, set};
 use std::{fs, path::Path, process::ExitCode};
@@ -91,21 +91,20 @@ fn unknown(experiment: &str) -> Failure {
 }
 
 /// `rit experiments`.
-#[allow(
-    clippy::print_stdout,
-    clippy::unnecessary_wraps,
-    reason = "a command like the others, and its output"
-)]
 pub fn print() -> Result<ExitCode, Failure> {
-    println!("experiments: task sets with their settings, `rit train EXPERIMENT`");
-    for (name, text) in EXPERIMENTS {
-        println!("  {name:38} {}", text.lines().next().unwrap_or_default().trim_start_matches("# "));
-    }
-    println!("\nalgorithms: any of them on any task set, `rit train EXPERIMENT --algorithm NAME`");
-    for facts in Method::ALL.map(Method::facts) {
+    let experiments = EXPERIMENTS.map(|(name, text)| {
+        format!("  {name:38} {}\n", text.lines().next().unwrap_or_default().trim_start_matches("# "))
+    });
+    let algorithms = Method::ALL.map(Method::facts).map(|facts| {
         let not_yet = if facts.built { "" } else { " (not built yet)" };
-        println!("  {:38} {}{not_yet}", facts.name, facts.summary);
-    }
+        format!("  {:38} {}{not_yet}\n", facts.name, facts.summary)
+    });
+    output::print(&format!(
+        "experiments: task sets with their settings, `rit train EXPERIMENT`\n{}\nalgorithms: any of them on any task set, \
+         `rit train EXPERIMENT --algorithm NAME`\n{}",
+        experiments.concat(),
+        algorithms.concat()
+    ))?;
     Ok(ExitCode::SUCCESS)
 }
 

@@ -1,10 +1,11 @@
 //! How a command ends when it does not end well: a one-line message and an exit code.
 
+use crate::output;
 use rit_actor::ActorError;
 use rit_config::{ConfigError, RunDirError};
 use rit_env::{TaskError, UnfitScript, UnknownName, rollout::LostEpisode};
-use rit_learner::{LearnerError, weights_file::WeightsFileError};
-use rit_proto::transport::{ConnectError, CredentialsError};
+use rit_learner::{LearnerError, evaluation::TasksError, weights_file::WeightsFileError};
+use rit_proto::transport::{ConnectError, CredentialsError, status_words};
 use std::{fmt, process::ExitCode};
 
 /// Exit code of a run that was interrupted and ended in order, as shells have it for Ctrl-C.
@@ -46,10 +47,10 @@ impl Failure {
         Self::Runtime(anyhow::anyhow!("{message}"))
     }
 
-    /// Prints the message; returns the exit code.
-    #[allow(clippy::print_stderr, reason = "the last word of a command")]
+    /// Says the message; returns the exit code.
     pub fn report(&self) -> ExitCode {
-        eprintln!("error: {self}");
+        // The exit code says it too, should nobody be there to be told.
+        let _ = output::say(&format!("error: {self}"));
         ExitCode::from(match self {
             Self::Input(_) => 2,
             Self::Runtime(_) => 1,
@@ -61,9 +62,25 @@ impl Failure {
 impl fmt::Display for Failure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Input(error) | Self::Runtime(error) | Self::Unavailable(error) => write!(f, "{error:#}"),
+            Self::Input(error) | Self::Runtime(error) | Self::Unavailable(error) => {
+                f.write_str(&in_one_line(error))
+            }
         }
     }
+}
+
+/// An error and its causes, each said once: many an error's words hold those of its cause already. On one line.
+fn in_one_line(error: &anyhow::Error) -> String {
+    let mut words = String::new();
+    for cause in error.chain().map(ToString::to_string) {
+        if words.is_empty() {
+            words = cause;
+        } else if !words.contains(&cause) {
+            words += &format!(": {cause}");
+        }
+    }
+    let lines = words.lines().map(str::trim).filter(|line| !line.is_empty());
+    lines.collect::<Vec<_>>().join("; ").replace(char::is_control, " ")
 }
 
 impl From<ConfigError> for Failure {
@@ -92,6 +109,12 @@ impl From<LostEpisode> for Failure {
 
 impl From<UnknownName> for Failure {
     fn from(error: UnknownName) -> Self {
+        Self::input(error)
+    }
+}
+
+impl From<TasksError> for Failure {
+    fn from(error: TasksError) -> Self {
         Self::input(error)
     }
 }
@@ -158,7 +181,36 @@ impl From<tonic::Status> for Failure {
             tonic::Code::InvalidArgument | tonic::Code::NotFound | tonic::Code::AlreadyExists => {
                 Self::input_message(message)
             }
-            _ => Self::runtime_message(format!("the learner answers: {message}")),
+            _ => Self::runtime_message(match status_words(&status) {
+                words if words == message => format!("the learner answers: {words}"),
+                words => format!("{words}; is the run still going, and not under load or stopped?"),
+            }),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cause_that_was_said_is_not_said_again_and_lines_are_one() {
+        #[derive(Debug, thiserror::Error)]
+        #[error("run/config.toml: {0}")]
+        struct Outer(#[source] ConfigError);
+        let inner = rit_config::set("algorithm.gama=1").unwrap_err();
+        let words = inner.to_string();
+        assert_eq!(Failure::input(Outer(inner)).to_string(), format!("run/config.toml: {words}"));
+        let failure = Failure::runtime(anyhow::anyhow!("disk\nfull\u{1b}[0m").context("cannot write"));
+        assert_eq!(failure.to_string(), "cannot write: disk; full [0m");
+    }
+
+    #[test]
+    fn a_broken_connection_is_said_without_the_words_of_its_libraries() {
+        let cause = std::io::Error::other("h2 protocol error: error reading a body from connection");
+        let broken = Failure::from(tonic::Status::from_error(Box::new(cause)));
+        assert!(broken.to_string().starts_with("the connection broke; is the run still going"), "{broken}");
+        let said = Failure::from(tonic::Status::unavailable("the run is over"));
+        assert_eq!(said.to_string(), "the learner answers: the run is over");
     }
 }

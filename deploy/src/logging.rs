@@ -1,18 +1,37 @@
-//! Logs: human on a terminal, JSON by flag; every process names itself.
+//! Logs: human on a terminal, JSON by flag; every process names itself. A log that cannot be written ends nothing.
 
 use crate::failure::Failure;
 use clap::{Args, ValueEnum};
 use rit_learner::run_handle::SetLog;
 use std::{
+    fs::OpenOptions,
     io::{self, IsTerminal as _},
-    sync::Arc,
+    path::Path,
+    sync::{Arc, Mutex},
 };
-use tracing_subscriber::{EnvFilter, fmt, reload};
+use tracing_subscriber::{EnvFilter, fmt, fmt::writer::BoxMakeWriter, reload};
+
+/// What a level may be called.
+const LEVELS: [&str; 6] = ["error", "warn", "info", "debug", "trace", "off"];
+
+/// The parts of this program that log.
+const PARTS: [&str; 10] = [
+    "rit",
+    "rit_actor",
+    "rit_algo",
+    "rit_config",
+    "rit_env",
+    "rit_episode",
+    "rit_ipc",
+    "rit_learner",
+    "rit_nn",
+    "rit_proto",
+];
 
 /// What the command line says of logs.
 #[derive(Args, Clone, Debug)]
 pub struct LogOptions {
-    /// What is logged: error, warn, info, debug, trace, or a filter such as rit_learner=debug
+    /// What is logged: error, warn, info, debug, trace, off, or a filter such as rit_learner=debug
     #[arg(long, global = true, env = "RIT_LOG", default_value = "info", value_name = "FILTER")]
     pub log: String,
     /// How it is logged
@@ -39,17 +58,51 @@ impl LogOptions {
         ["--log".into(), self.log.clone(), "--log-format".into(), format.into()]
     }
 
+    /// Whether the filter means something.
+    ///
+    /// # Errors
+    /// When it does not.
+    pub fn check(&self) -> Result<(), Failure> {
+        self.filter().map(drop)
+    }
+
+    fn filter(&self) -> Result<EnvFilter, Failure> {
+        filter(&self.log).map_err(|error| Failure::input_message(format!("--log {error}")))
+    }
+
     /// Begins to log to standard error. The span returned names the process in every line; the function changes what
     /// is logged.
     ///
     /// # Errors
     /// When the filter means nothing.
     pub fn start(&self, process: &str) -> Result<(tracing::Span, SetLog), Failure> {
-        let filter = EnvFilter::try_new(&self.log);
-        let filter =
-            filter.map_err(|error| Failure::input_message(format!("--log {}: {error}", self.log)))?;
-        let builder =
-            fmt().with_env_filter(filter).with_writer(io::stderr).with_ansi(io::stderr().is_terminal());
+        self.start_on(BoxMakeWriter::new(io::stderr), io::stderr().is_terminal(), process)
+    }
+
+    /// Begins to log to a file, at its end; where that cannot be had, nowhere.
+    ///
+    /// # Errors
+    /// When the filter means nothing.
+    pub fn start_in(&self, path: &Path, process: &str) -> Result<tracing::Span, Failure> {
+        let writer = match OpenOptions::new().create(true).append(true).open(path) {
+            Ok(file) => BoxMakeWriter::new(Mutex::new(file)),
+            Err(_) => BoxMakeWriter::new(io::sink),
+        };
+        Ok(self.start_on(writer, false, process)?.0)
+    }
+
+    fn start_on(
+        &self,
+        writer: BoxMakeWriter,
+        ansi: bool,
+        process: &str,
+    ) -> Result<(tracing::Span, SetLog), Failure> {
+        let builder = fmt()
+            .with_env_filter(self.filter()?)
+            .with_writer(writer)
+            .with_ansi(ansi)
+            // It would be told by a macro that panics where it cannot write either.
+            .log_internal_errors(false);
         let set_log = match self.log_format {
             LogFormat::Human => {
                 let builder = builder.with_target(false).with_filter_reloading();
@@ -69,8 +122,58 @@ impl LogOptions {
 }
 
 fn set_log<S: 'static>(handle: reload::Handle<EnvFilter, S>) -> SetLog {
-    Arc::new(move |filter| {
-        let filter = EnvFilter::try_new(filter).map_err(|error| error.to_string())?;
-        handle.reload(filter).map_err(|error| error.to_string())
-    })
+    Arc::new(move |text| handle.reload(filter(text)?).map_err(|error| error.to_string()))
+}
+
+/// The filter that is meant. Its library takes any word for the name of some part, and then logs nothing.
+fn filter(text: &str) -> Result<EnvFilter, String> {
+    let levels = LEVELS.join(", ");
+    // Spans have fields with commas and equals signs of their own.
+    for directive in text.split(',').filter(|_| !text.contains('[')) {
+        let (target, level) = directive.split_once('=').unwrap_or(("", directive));
+        if !LEVELS.iter().any(|known| level.eq_ignore_ascii_case(known)) {
+            return Err(format!(
+                "{text:?}: {level:?} is no level; write one of {levels}, or a filter such as rit_learner=debug"
+            ));
+        }
+        let part = target.split("::").next().unwrap_or_default();
+        if part.starts_with("rit") && !PARTS.contains(&part) {
+            let parts = PARTS.join(", ");
+            return Err(format!("{text:?}: {part:?} is no part of this program; those are {parts}"));
+        }
+    }
+    EnvFilter::try_new(text).map_err(|error| format!("{text:?}: {error}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_filter_means_something_or_is_refused_with_what_there_is() {
+        for text in [
+            "info",
+            "DEBUG",
+            "off",
+            "rit_learner=debug",
+            "warn,rit::train=trace,h2=off",
+            "[span{a=1,b}]=info",
+        ] {
+            assert!(filter(text).is_ok(), "{text}");
+        }
+        for (text, message) in [
+            (
+                "debgu",
+                "\"debgu\" is no level; write one of error, warn, info, debug, trace, off, or a filter",
+            ),
+            ("", "\"\" is no level"),
+            ("rit_learner", "\"rit_learner\" is no level"),
+            ("rit_learner=loud", "\"loud\" is no level"),
+            ("info,rit_lerner=debug", "\"rit_lerner\" is no part of this program; those are rit, rit_actor"),
+            ("[span=", "\"[span=\": "),
+        ] {
+            let error = filter(text).unwrap_err();
+            assert!(error.contains(message) && !error.contains('\n'), "{text}: {error}");
+        }
+    }
 }

@@ -9,7 +9,11 @@ mod ctl;
 mod evaluate;
 mod experiments;
 mod failure;
+mod finished;
+mod last_words;
 mod logging;
+mod new_file;
+mod output;
 mod player;
 mod plot;
 mod processes;
@@ -20,6 +24,7 @@ mod shutdown;
 mod soak;
 mod supervisor;
 mod train;
+mod usage;
 mod warnings;
 mod watch;
 
@@ -29,7 +34,10 @@ use failure::Failure;
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => return usage::report(&error),
+    };
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
     let result = match runtime {
         Ok(runtime) => {
@@ -48,6 +56,7 @@ fn main() -> ExitCode {
 
 async fn run(cli: Cli) -> Result<ExitCode, Failure> {
     let logs = cli.logs;
+    logs.check()?;
     match cli.command {
         Command::Train(options) => train::run(options, logs).await,
         Command::Learner(options) => processes::learner(options, logs).await,
@@ -62,7 +71,9 @@ async fn run(cli: Cli) -> Result<ExitCode, Failure> {
         Command::Certificates(options) => certificates::run(&options),
         Command::Experiments => experiments::print(),
         Command::Completions { shell } => {
-            clap_complete::generate(shell, &mut Cli::command(), "rit", &mut std::io::stdout());
+            let mut script = Vec::new();
+            clap_complete::generate(shell, &mut Cli::command(), "rit", &mut script);
+            output::print(&String::from_utf8_lossy(&script))?;
             Ok(ExitCode::SUCCESS)
         }
     }

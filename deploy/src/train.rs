@@ -4,30 +4,45 @@ use crate::{
     cli::{ConfigOptions, TrainOptions},
     experiments::{self, Experiment},
     failure::{Failure, INTERRUPTED},
+    finished::Finished,
     logging::LogOptions,
+    output::{self, Reader},
     progress::Progress,
-    report,
     supervisor::{Outcome, watch_over},
 };
 use rit_config::{Config, RunDir};
 use rit_ipc::RunSpace;
-use rit_proto::v1::TaskResult;
-use std::{fs, path::Path, process::ExitCode};
+use std::{fs, num::NonZero, path::Path, process::ExitCode};
+use tracing::Instrument as _;
 
 /// `rit train`.
 pub async fn run(options: TrainOptions, logs: LogOptions) -> Result<ExitCode, Failure> {
     let (run_dir, config, name) = prepare(&options.config)?;
-    let mut progress = Progress::new(config.training.t_max, options.json);
+    let span = logs.start_in(&run_dir.logs().join("train.log"), "train")?;
+    supervise(&run_dir, &config, &name, &logs, options.json).instrument(span).await
+}
+
+async fn supervise(
+    run_dir: &RunDir,
+    config: &Config,
+    name: &str,
+    logs: &LogOptions,
+    json: bool,
+) -> Result<ExitCode, Failure> {
+    let mut progress = Progress::new(config.training.t_max, json);
     let root = run_dir.root().display();
     progress.say(&format!("{name}: learner and {} actors, run directory {root}", config.actors.count));
+    if let Some(words) = too_many_actors(config.actors.count) {
+        progress.say(&words);
+    }
 
-    let outcome = watch_over(&run_dir, &logs, &mut progress, config.actors.count as u32).await;
+    let outcome = watch_over(run_dir, logs, &mut progress, config.actors.count as u32).await;
     progress.finish();
-    remove_shared_memory(&run_dir);
+    remove_shared_memory(run_dir);
     match outcome {
-        Outcome::Finished => print_summary(&run_dir, options.json).map(|()| ExitCode::SUCCESS),
+        Outcome::Finished => print_summary(run_dir, json).map(|()| ExitCode::SUCCESS),
         Outcome::Interrupted => {
-            print_summary(&run_dir, options.json)?;
+            print_summary(run_dir, json)?;
             Ok(ExitCode::from(INTERRUPTED))
         }
         Outcome::Failed { input: true, message } => {
@@ -67,6 +82,18 @@ fn prepare(options: &ConfigOptions) -> Result<(RunDir, Config, String), Failure>
     Ok((run_dir, config, name))
 }
 
+/// What to say of more actors than the machine has work for.
+fn too_many_actors(count: usize) -> Option<String> {
+    // Two for a processor still make up for each other's waiting.
+    let processors = std::thread::available_parallelism().map_or(1, NonZero::get);
+    (count > 2 * processors).then(|| {
+        format!(
+            "{count} actors share {processors} processors with the learner: they will mostly wait for each other, and \
+             {processors} would do (--actors {processors})"
+        )
+    })
+}
+
 fn refuse_no_actors(config: &Config) -> Result<(), Failure> {
     if config.actors.count > 0 || config.actors.remote > 0 {
         return Ok(());
@@ -85,38 +112,18 @@ pub fn remove_shared_memory(run_dir: &RunDir) {
     }
 }
 
-/// Prints what `summary.json` says.
-#[allow(clippy::print_stdout, reason = "what the command is for")]
-pub fn print_summary(run_dir: &RunDir, json: bool) -> Result<(), Failure> {
-    let path = run_dir.summary();
-    let text = fs::read_to_string(&path).map_err(Failure::runtime)?;
-    if json {
-        println!("{}", text.trim_end());
-        return Ok(());
-    }
-    let summary: serde_json::Value = serde_json::from_str(&text).map_err(Failure::runtime)?;
-    let number = |key: &str| summary[key].as_u64().unwrap_or_default();
-    let results: Vec<TaskResult> =
-        summary["evaluation"].as_object().into_iter().flatten().map(task_result).collect();
-    println!(
-        "{} environment steps, {} episodes, {} updates in {}",
-        report::grouped(number("env_steps")),
-        report::grouped(number("episodes")),
-        report::grouped(number("updates")),
-        report::duration(summary["wall_s"].as_f64().unwrap_or_default())
-    );
-    print!("{}", report::table(&results));
-    println!("weights digest {}", summary["weights_digest"].as_str().unwrap_or_default());
-    println!("run directory  {}", run_dir.root().display());
+/// Prints what the run came to. Where that cannot be written the run has come to its end all the same, and the exit
+/// code is that of the run.
+fn print_summary(run_dir: &RunDir, json: bool) -> Result<(), Failure> {
+    let finished = Finished::read(run_dir)?;
+    let why = match output::print(&if json { finished.json() } else { finished.text() }) {
+        Ok(Reader::There) => return Ok(()),
+        Ok(Reader::Gone) => "nobody reads standard output any more".to_owned(),
+        Err(failure) => {
+            let _ = output::say(&format!("{failure}; the run is whole, and its summary in summary.json"));
+            failure.to_string()
+        }
+    };
+    tracing::warn!(why, "the summary is in summary.json alone");
     Ok(())
-}
-
-fn task_result((task, result): (&String, &serde_json::Value)) -> TaskResult {
-    TaskResult {
-        task: task.clone(),
-        episodes: result["episodes"].as_u64().unwrap_or_default(),
-        mean_return: result["mean_return"].as_f64().unwrap_or_default(),
-        win_rate: result["win_rate"].as_f64(),
-        ..TaskResult::default()
-    }
 }

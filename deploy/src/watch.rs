@@ -4,7 +4,14 @@ mod model;
 mod screen;
 mod view;
 
-use crate::{cli::WatchOptions, control, failure::Failure, report, shutdown, train};
+use crate::{
+    cli::WatchOptions,
+    control::{self, Reached},
+    failure::Failure,
+    finished::Finished,
+    output::{self, Reader},
+    report, shutdown,
+};
 use model::Model;
 use rit_config::{Config, RunDir};
 use rit_proto::v1::{MetricsRequest, StatusRequest, metrics_update::Update};
@@ -27,8 +34,11 @@ const AWAY_POLL: Duration = Duration::from_millis(200);
 /// `rit watch`.
 pub async fn run(options: &WatchOptions) -> Result<ExitCode, Failure> {
     let (run_dir, config) = RunDir::open(&options.run)?;
-    // Said before the screen changes: a run that is not there.
-    drop(control::connect(&run_dir).await?);
+    // Before the screen changes: a run that is not there, or over.
+    if let Reached::Over(finished) = control::reach(&run_dir).await? {
+        output::print(&finished.status_text())?;
+        return Ok(ExitCode::SUCCESS);
+    }
     let name =
         run_dir.root().file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
     let mut model = Model::new(name);
@@ -39,9 +49,9 @@ pub async fn run(options: &WatchOptions) -> Result<ExitCode, Failure> {
     };
     screen.close();
     match watched? {
-        Ended::Over => train::print_summary(&run_dir, false)?,
-        Ended::Quit => screen::print(&report::status_line(&model.status)),
-    }
+        Ended::Over => output::print(&Finished::read(&run_dir)?.text())?,
+        Ended::Quit => output::print(&(report::status_line(&model.status) + "\n"))?,
+    };
     Ok(ExitCode::SUCCESS)
 }
 
@@ -74,7 +84,9 @@ async fn watch(
             return Ok(Ended::Over);
         }
         model.lost();
-        screen.show(model);
+        if screen.show(model)? == Reader::Gone {
+            return Ok(Ended::Quit);
+        }
         if screen.quits_within(AWAY_POLL).await {
             return Ok(Ended::Quit);
         }
@@ -97,7 +109,9 @@ async fn follow(
         status_every_ms: STATUS_EVERY_MS,
     };
     model.status(status);
-    screen.show(model);
+    if screen.show(model)? == Reader::Gone {
+        return Ok(Some(Ended::Quit));
+    }
     let mut updates = control.metrics(request).await?.into_inner();
     loop {
         let update = tokio::select! {
@@ -108,7 +122,9 @@ async fn follow(
             Ok(Some(Update::Line(line))) => model.line(&line),
             Ok(Some(Update::Status(status))) => {
                 model.status(status);
-                screen.show(model);
+                if screen.show(model)? == Reader::Gone {
+                    return Ok(Some(Ended::Quit));
+                }
             }
             Ok(None) => return Ok(Some(Ended::Over)),
             Err(_) => return Ok(None),

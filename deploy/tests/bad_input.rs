@@ -17,14 +17,83 @@ fn what_is_typed_wrong_is_named() {
     train(&["matrx-game"], &["unknown experiment \"matrx-game\"", "did you mean matrix-game?"]);
     train(&["no/such/file.toml"], &["no/such/file.toml", "No such file"]);
     train(&["matrix-game", "--set", "algorithm.gamma=7"], &["algorithm.gamma = 7 is out of range 0..=1"]);
-    train(&["matrix-game", "--set", "algorithm.gama=0.9"], &["did you mean \"algorithm.gamma\"?"]);
+    train(&["matrix-game", "--set", "algorithm.gama=0.9"], &["did you mean algorithm.gamma?"]);
     train(&["matrix-game", "--set", "algorithm.gamma"], &["write --set section.key=value"]);
+    train(&["matrix-game", "--set", "training.t_max=6\nseed=9"], &["training.t_max must be a whole number"]);
+    train(&["matrix-game", "--set", "algorithm.mixing=vdn"], &["algorithm.mixing must be", "network"]);
+    train(
+        &["matrix-game", "--set", "algorithm.optimizer=sgd"],
+        &["algorithm.optimizer = \"sgd\"", "rmsprop, adam"],
+    );
+    train(&["matrix-game", "--set", "learner.device=cuda"], &["[learner] has listen,"]);
+    train(&["matrix-game", "--lr", "0.1"], &["--set algorithm.lr=VALUE"]);
+    train(
+        &["matrix-game", "--seed", "9223372036854775808"],
+        &["--seed", "out of range 0..=9223372036854775807"],
+    );
+    train(&["matrix-game", "--steps", "soon"], &["--steps", "1e6, 100k or 2M"]);
+    train(
+        &["matrix-game", "--log", "debgu"],
+        &["\"debgu\" is no level", "error, warn, info, debug, trace, off"],
+    );
+    train(&["cooperative-navigation", "--until", "win_rate=0.9"], &["know no winning", "mean_return=NUMBER"]);
     train(&["matrix-game", "--until", "luck=1"], &["write win_rate=NUMBER or mean_return=NUMBER"]);
     train(&["matrix-game", "--actors", "0"], &["needs at least one actor"]);
     train(&["matrix-game", "--steps", "0"], &["training.t_max = 0 is out of range"]);
     let file = folder.path().join("mine.toml");
     fs::write(&file, "environment.task_set = \"matrix-game\"\nnetwork.hiden_dim = 32").unwrap();
     train(&[file.to_str().unwrap()], &["unknown key \"network.hiden_dim\"", "network.hidden_dim"]);
+    fs::write(&file, "environment.task_set = \"matrix-game\"\n\nseed = = 3").unwrap();
+    train(&[file.to_str().unwrap()], &["mine.toml, line 3, column 8: "]);
+}
+
+#[test]
+fn other_commands_name_what_is_typed_wrong_too() {
+    let folder = RunFolder::new();
+    let certificates = folder.path().join("certificates");
+    for host in ["", "a b", "a\nb", "a-", "a..b", "*"] {
+        let arguments = ["certificates", "--out", certificates.to_str().unwrap(), "--host", host];
+        refused(&arguments, &["--host", "write a host's name or IP address"]);
+        assert!(!certificates.exists());
+    }
+    refused(&["experiments", "--log", "debgu"], &["\"debgu\" is no level"]);
+    let matrix =
+        ["evaluate", "--policy", "script:random", "--experiment", "matrix-game", "--tasks", "testing"];
+    refused(&matrix, &["matrix-game has no testing tasks", "game-1, game-2, game-3, game-4"]);
+    refused(&["plot", "x", "--out", "y.svg", "--line", "nan"], &["--line", "write a number"]);
+    refused(&["plot", "x", "--out", "y.png"], &["y.png", "ends in .svg"]);
+}
+
+#[test]
+fn a_plot_is_made_of_runs_of_one_kind_and_written_over_nothing() {
+    let folder = RunFolder::new();
+    folder.train(&["matrix-game", "--steps", "100", "--set", "evaluation.episodes=2"]);
+    let (run_dir, out) = (folder.run_dir(), folder.path().join("curves.svg"));
+    let (run, file) = (run_dir.to_str().unwrap(), out.to_str().unwrap());
+    assert!(output(&["plot", run, "--out", file]).status.success());
+    let drawn = fs::read_to_string(&out).unwrap();
+    assert!(drawn.contains("mean return, greedy") && drawn.contains("game-4"), "{drawn}");
+    refused(&["plot", run, "--out", file], &["curves.svg is there already; --force writes over it"]);
+    assert!(output(&["plot", run, "--out", file, "--force", "--metric", "win_rate"]).status.success());
+    assert!(fs::read_to_string(&out).unwrap().contains("win rate, greedy"));
+    refused(&["plot", run, run, "--out", file, "--force"], &["are the same run, seed 1: give it once"]);
+
+    let other = RunFolder::new();
+    other.train(&[
+        "matrix-game",
+        "--steps",
+        "100",
+        "--set",
+        "evaluation.episodes=2",
+        "--set",
+        "algorithm.gamma=0.5",
+    ]);
+    let other = other.run_dir();
+    let pair = ["plot", run, other.to_str().unwrap(), "--out", file, "--force"];
+    refused(&pair, &["algorithm.gamma (0.99, 0.5)", "--compare"]);
+    assert!(output(&[&pair[..], &["--compare"]].concat()).status.success());
+    let drawn = fs::read_to_string(&out).unwrap();
+    assert!(drawn.contains("gamma 0.99") && drawn.contains("gamma 0.5"), "{drawn}");
 }
 
 #[test]

@@ -100,7 +100,7 @@ fn settings_change_while_the_run_goes_on() {
         ("algorithm.gamma=0.5", "algorithm.gamma cannot change while the learner runs"),
         ("actors.count=17", "actors.count = 17 is out of range 0..=16"),
         ("algorithm.epsilon_finish=2", "algorithm.epsilon_finish = 2 is out of range 0..=1"),
-        ("actors.cuont=2", "did you mean \"actors.count\"?"),
+        ("actors.cuont=2", "did you mean actors.count?"),
         ("nonsense", "write KEY=VALUE"),
     ] {
         let refused = train.ctl(&["set", setting]);

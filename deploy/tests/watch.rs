@@ -10,7 +10,7 @@ use rustix::{
     termios::{Winsize, tcsetwinsize},
 };
 use std::{
-    fs::{File, OpenOptions},
+    fs::{self, File, OpenOptions},
     io::{BufRead as _, BufReader, Read as _, Write as _},
     os::unix::ffi::OsStrExt as _,
     process::Stdio,
@@ -43,14 +43,41 @@ fn off_a_terminal_it_prints_lines_through_a_restart_of_the_learner_to_the_end() 
 }
 
 #[test]
-fn a_run_that_is_not_there_is_said_at_once() {
+fn a_run_that_is_over_is_shown_as_what_it_came_to() {
     let folder = RunFolder::new();
-    folder.train(&["matrix-game", "--steps", "100"]);
+    let summary = folder.train(&["matrix-game", "--steps", "100", "--set", "evaluation.episodes=2"]);
     let run_dir = folder.run_dir();
-    let watch = output(&["watch", "--run", run_dir.to_str().unwrap()]);
+    let run = run_dir.to_str().unwrap();
+    let digest = summary["weights_digest"].as_str().unwrap();
+    for arguments in [&["watch", "--run", run][..], &["ctl", "--run", run, "status"]] {
+        let shown = output(arguments);
+        assert_eq!(shown.status.code(), Some(0), "{arguments:?}");
+        let text = String::from_utf8(shown.stdout).unwrap();
+        for part in ["the run is over", "100 environment steps, 50 episodes", "game-3", digest] {
+            assert!(text.contains(part), "{part:?} in\n{text}");
+        }
+    }
+    let status = output(&["ctl", "--run", run, "--json", "status"]);
+    let status: serde_json::Value = serde_json::from_slice(&status.stdout).unwrap();
+    assert_eq!((&status["state"], &status["summary"]), (&"over".into(), &summary));
+    let metrics = String::from_utf8(output(&["ctl", "--run", run, "metrics"]).stdout).unwrap();
+    assert!(metrics.starts_with("0 steps · 0 updates · greedy: return "), "{metrics}");
+
+    for (command, words) in [("web", "the run is over and its page with it"), ("pause", "goes on with it")] {
+        let refused = output(&["ctl", "--run", run, command]);
+        let stderr = String::from_utf8_lossy(&refused.stderr);
+        assert_eq!(refused.status.code(), Some(1), "{command}");
+        assert!(stderr.contains(words) && stderr.lines().count() == 1, "{stderr}");
+    }
+    // One that was killed before its end is not over: what its checkpoints hold was never summed up.
+    fs::remove_file(run_dir.join("summary.json")).unwrap();
+    let watch = output(&["watch", "--run", run]);
     assert_eq!(watch.status.code(), Some(1));
     let stderr = String::from_utf8_lossy(&watch.stderr);
-    assert!(stderr.starts_with("error: no learner runs for "), "{stderr}");
+    assert!(
+        stderr.starts_with("error: no learner runs for ") && stderr.contains("rit train --resume"),
+        "{stderr}"
+    );
 }
 
 /// A pseudo-terminal of the usual size: whoever sits at it, and what a process gets.

@@ -13,7 +13,7 @@ use std::{
     net::{TcpListener, TcpStream},
     os::unix::fs::PermissionsExt as _,
     process::{Child, Command, Stdio},
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 /// Far beyond what a step takes.
@@ -218,7 +218,7 @@ fn what_is_asked_is_answered_and_nonsense_is_refused() {
 
     for (path, body, status, message) in [
         ("/api/evaluate", json!({ "tasks": ["chess"] }), 400, "unknown task \"chess\"; known: game-1"),
-        ("/api/evaluate", json!({ "tasks": ["testing"] }), 400, "matrix-game has no such tasks"),
+        ("/api/evaluate", json!({ "tasks": ["testing"] }), 400, "matrix-game has no testing tasks"),
         ("/api/evaluate", json!({ "tasks": [], "episodes": 1_000_001 }), 400, "at most 1000000"),
         ("/api/evaluate", json!({ "task": "game-1" }), 422, "unknown field"),
         ("/api/watch", json!({ "task": "x".repeat(5000), "number": 0 }), 413, "limit"),
@@ -326,6 +326,32 @@ fn the_page_is_for_this_machine_alone_or_off() {
     assert!(String::from_utf8_lossy(&asked.stderr).contains("serves no web page"));
 }
 
+/// A script's expression: what is not where it should be on the page.
+const OUT_OF_PLACE: &str = "(() => {
+    const found = document.documentElement.scrollWidth > innerWidth ? ['the page is wider than the screen'] : [];
+    for (const card of document.querySelectorAll('.card, .tiles, header')) {
+        const { left, right } = card.getBoundingClientRect();
+        for (const part of card.querySelectorAll('*')) {
+            const box = part.getBoundingClientRect();
+            const scrolls = part.closest('pre') !== null;
+            if (box.width && !scrolls && (box.right > right + 1 || box.left < left - 1)) found.push(part.outerHTML);
+        }
+    }
+    const words = document.querySelectorAll('.tiles dt, .tiles dd, header p, header button, th, td, .legend li, h2');
+    const texts = [...words].filter((part) => part.getClientRects().length && part.textContent.trim());
+    const boxes = texts.map((part) => {
+        const range = document.createRange();
+        range.selectNodeContents(part);
+        return range.getBoundingClientRect();
+    });
+    boxes.forEach((a, at) => boxes.slice(at + 1).forEach((b, after) => {
+        const [one, other] = [texts[at], texts[at + 1 + after]];
+        const apart = a.right <= b.left + 1 || b.right <= a.left + 1 || a.bottom <= b.top + 1 || b.bottom <= a.top + 1;
+        if (!apart && !one.contains(other)) found.push(`${one.textContent} lies on ${other.textContent}`);
+    }));
+    return found;
+})()";
+
 /// A browser, and the process that drives it.
 struct Browser {
     driver: Child,
@@ -391,6 +417,16 @@ impl Browser {
     async fn click(&self, id: &str) {
         let enabled = format!("#{id}:enabled");
         self.find(Locator::Css(&enabled)).await.click().await.unwrap();
+    }
+
+    /// Until a script says so.
+    async fn until(&self, script: &str) {
+        let begun = Instant::now();
+        while self.js(script).await != true {
+            if begun.elapsed() > DEADLINE {
+                panic!("out of place: {}", self.js(&format!("return [innerWidth, {OUT_OF_PLACE}]")).await);
+            }
+        }
     }
 
     async fn js(&self, script: &str) -> Value {
@@ -477,6 +513,10 @@ async fn a_browser_shows_the_run_and_steers_it() {
         const xs = [...line.matchAll(/[ML]([0-9.]+)/g)].map((x) => Number(x[1]));
         return xs.length > 1 && xs.every((x, at) => at === 0 || xs[at - 1] < x)";
     assert_eq!(browser.js(script).await, true);
+
+    // On a phone nothing is wider than the screen, leaves its card, or lies on other words.
+    browser.client.set_window_size(390, 844).await.unwrap();
+    browser.until(&format!("return innerWidth === 390 && ({OUT_OF_PLACE}).length === 0")).await;
 
     browser.click("stop").await;
     browser.click("stop-confirm").await;

@@ -13,6 +13,7 @@ use crate::{
     cli::{BenchKind, BenchOptions},
     experiments,
     failure::Failure,
+    output,
     player::Trained,
 };
 use rit_algo::{Method, Model};
@@ -27,7 +28,6 @@ use serde_json::{Map, Value};
 use std::{process::ExitCode, sync::Arc, time::Duration};
 
 /// `rit bench`.
-#[allow(clippy::print_stdout, reason = "what the command is for")]
 pub fn run(options: &BenchOptions) -> Result<ExitCode, Failure> {
     let duration = Duration::from_secs_f64(options.seconds);
     let mut report = if options.algorithm.as_deref() == Some(ALL) {
@@ -41,21 +41,7 @@ pub fn run(options: &BenchOptions) -> Result<ExitCode, Failure> {
     } else if !matches!(options.kind, BenchKind::Ipc) {
         report.insert("experiment".into(), options.experiment.clone().into());
     }
-    if options.json {
-        println!("{:#}", Value::Object(report));
-    } else {
-        let width = report.keys().map(String::len).max().unwrap_or(0);
-        for (key, value) in &report {
-            match value {
-                Value::Number(number) if number.is_f64() => {
-                    println!("{key:width$}  {:.3}", number.as_f64().unwrap_or_default());
-                }
-                Value::String(text) => println!("{key:width$}  {text}"),
-                Value::Array(rows) => println!("\n{key}\n{}", table(rows)),
-                value => println!("{key:width$}  {value}"),
-            }
-        }
-    }
+    output::print(&if options.json { format!("{:#}\n", Value::Object(report)) } else { lines(&report) })?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -99,6 +85,20 @@ fn every_method(options: &BenchOptions, duration: Duration) -> Result<Report, Fa
 
 /// Every method, in `--algorithm`.
 const ALL: &str = "all";
+
+/// The report for people.
+fn lines(report: &Report) -> String {
+    let width = report.keys().map(String::len).max().unwrap_or(0);
+    let line = |(key, value): (&String, &Value)| match value {
+        Value::Number(number) if number.is_f64() => {
+            format!("{key:width$}  {:.3}\n", number.as_f64().unwrap_or_default())
+        }
+        Value::String(text) => format!("{key:width$}  {text}\n"),
+        Value::Array(rows) => format!("\n{key}\n{}\n", table(rows)),
+        value => format!("{key:width$}  {value}\n"),
+    };
+    report.iter().map(line).collect()
+}
 
 /// Whose networks are measured.
 struct Measured {

@@ -12,16 +12,10 @@ mod recording;
 mod svg;
 mod view;
 
-use crate::{cli::RenderOptions, failure::Failure, player::Player};
+use crate::{cli::RenderOptions, failure::Failure, new_file, output, player::Player};
 use recording::{Film, Recording};
 use rit_learner::evaluation::Evaluator;
-use std::{
-    fs::Permissions,
-    io::{self, Write as _},
-    os::unix::fs::PermissionsExt as _,
-    path::Path,
-    process::ExitCode,
-};
+use std::{path::Path, process::ExitCode};
 
 /// What a file's ending asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -50,29 +44,26 @@ impl Format {
 }
 
 /// `rit render`.
-#[allow(clippy::print_stdout, reason = "what the command is for")]
 pub fn run(options: &RenderOptions) -> Result<ExitCode, Failure> {
     let format = Format::of(&options.out)?;
-    if options.out.exists() && !options.force {
-        return Err(occupied(&options.out));
-    }
+    new_file::check(&options.out, options.force)?;
     let film = record(options)?;
     let bytes = match format {
         Format::Gif => gif::encode(&film)?,
         Format::Png => png::encode(&film)?,
         Format::Svg => svg::encode(&film).into_bytes(),
     };
-    write(&options.out, &bytes, options.force)?;
+    new_file::write(&options.out, &bytes, options.force)?;
     let returns: Vec<_> =
         film.episodes.iter().map(|episode| format!("{:.2}", episode.episode.total_reward())).collect();
-    println!(
-        "{}: {} by {}, {} kB, return {}",
+    output::print(&format!(
+        "{}: {} by {}, {} kB, return {}\n",
         options.out.display(),
         film.task,
         film.policy,
         bytes.len().div_ceil(1000),
         returns.join(", ")
-    );
+    ))?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -96,28 +87,6 @@ fn record(options: &RenderOptions) -> Result<Film, Failure> {
     let pairs = scenes.into_iter().zip(episodes);
     let episodes = pairs.map(|(scenes, episode)| Recording { scenes, episode }).collect();
     Ok(Film { task, policy: player.name, episodes })
-}
-
-/// Whole or not at all: written beside its place and moved there.
-fn write(path: &Path, bytes: &[u8], force: bool) -> Result<(), Failure> {
-    let wrong = |error: io::Error| {
-        if error.kind() == io::ErrorKind::AlreadyExists {
-            occupied(path)
-        } else {
-            Failure::input_message(format!("--out {}: {error}", path.display()))
-        }
-    };
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let readable = Permissions::from_mode(0o666); // less what the umask takes
-    let mut partial = tempfile::Builder::new().permissions(readable).tempfile_in(folder).map_err(wrong)?;
-    partial.write_all(bytes).map_err(wrong)?;
-    // Not there when looked for, but meanwhile it may be.
-    let moved = if force { partial.persist(path) } else { partial.persist_noclobber(path) };
-    moved.map(drop).map_err(|error| wrong(error.error))
-}
-
-fn occupied(path: &Path) -> Failure {
-    Failure::input_message(format!("{} is there already; --force writes over it", path.display()))
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! A run whose processes are killed.
 
-use crate::{control, failure::Failure};
+use crate::{control, failure::Failure, last_words::last_words};
 use rand::RngExt as _;
 use rit_config::RunDir;
 use rit_episode::Rng;
@@ -274,8 +274,7 @@ impl Run {
     }
 
     fn failed(&self) -> Failure {
-        let log = fs::read_to_string(log(&self.root)).unwrap_or_default();
-        let last = log.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("it said nothing");
+        let last = last_words(&log(&self.root), 0);
         let root = self.root.display();
         Failure::runtime_message(format!("the run in {root} ended by itself: {last}"))
     }

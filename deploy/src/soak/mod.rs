@@ -3,7 +3,7 @@
 
 mod fire;
 
-use crate::{cli::SoakOptions, experiments, failure::Failure};
+use crate::{cli::SoakOptions, experiments, failure::Failure, output};
 use fire::{Kill, Run, Victim};
 use rit_config::RunDir;
 use rit_episode::{Episode, RunSeed, Stream};
@@ -42,7 +42,6 @@ struct Times {
 ///
 /// # Errors
 /// When a run fails; a run that ends otherwise than the undisturbed one is no error here but exit code 1.
-#[allow(clippy::print_stdout, clippy::print_stderr, reason = "what the command is for")]
 pub async fn run(options: SoakOptions) -> Result<ExitCode, Failure> {
     let folder = &options.dir;
     if folder.exists() {
@@ -63,7 +62,8 @@ pub async fn run(options: SoakOptions) -> Result<ExitCode, Failure> {
 
     let say = |words: &str| {
         if !options.json {
-            eprintln!("{words}");
+            // The soak goes on for its end, whoever listens meanwhile.
+            let _ = output::say(words);
         }
     };
     say(&format!("{}: once undisturbed", options.experiment));
@@ -79,11 +79,11 @@ pub async fn run(options: SoakOptions) -> Result<ExitCode, Failure> {
     let found = run.finish().await?;
 
     let report = compare(folder, &kills, ledger_checks, &expected, &found)?;
-    if options.json {
-        println!("{}", serde_json::to_string_pretty(&report).map_err(Failure::runtime)?);
+    output::print(&if options.json {
+        serde_json::to_string_pretty(&report).map_err(Failure::runtime)? + "\n"
     } else {
-        print!("{}", table(&report));
-    }
+        table(&report)
+    })?;
     Ok(if report.same { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 

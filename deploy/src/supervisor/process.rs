@@ -1,11 +1,11 @@
 //! The child processes of `rit train`: this program, executed again.
 
 use super::{Exit, Place};
-use crate::logging::LogOptions;
+use crate::{last_words::last_words, logging::LogOptions};
 use std::{
     collections::BTreeMap,
-    fs::{File, OpenOptions},
-    io::{self, Read as _, Seek as _, SeekFrom},
+    fs::OpenOptions,
+    io,
     path::{Path, PathBuf},
     process::{ExitStatus, Stdio},
 };
@@ -15,9 +15,6 @@ use tokio::{
     task::JoinSet,
 };
 
-/// How much of a log's end is looked through for its last line.
-const LAST_WORDS_BYTES: u64 = 16 << 10;
-
 /// The processes there are, by their places.
 #[derive(Debug)]
 pub struct Processes<'a> {
@@ -25,6 +22,8 @@ pub struct Processes<'a> {
     logs: PathBuf,
     log_options: &'a LogOptions,
     handles: BTreeMap<Place, Handle>,
+    /// Length of each log when its process started: what lies before is of former ones.
+    log_begins_at: BTreeMap<Place, u64>,
     /// Each waits for the end of one.
     ends: JoinSet<(Place, io::Result<ExitStatus>)>,
 }
@@ -41,7 +40,14 @@ struct Handle {
 impl<'a> Processes<'a> {
     /// None yet; those of the run in `run_dir`, which log to `logs`.
     pub fn new(run_dir: &'a Path, logs: PathBuf, log_options: &'a LogOptions) -> Self {
-        Self { run_dir, logs, log_options, handles: BTreeMap::new(), ends: JoinSet::new() }
+        Self {
+            run_dir,
+            logs,
+            log_options,
+            handles: BTreeMap::new(),
+            log_begins_at: BTreeMap::new(),
+            ends: JoinSet::new(),
+        }
     }
 
     /// Starts a process. Returns its number.
@@ -50,6 +56,7 @@ impl<'a> Processes<'a> {
     /// When the system refuses.
     pub fn start(&mut self, place: Place) -> io::Result<Option<u32>> {
         let log = OpenOptions::new().create(true).append(true).open(self.log(place))?;
+        self.log_begins_at.insert(place, log.metadata()?.len());
         let mut command = Command::new(std::env::current_exe()?);
         match place {
             Place::Learner => command.arg("learner"),
@@ -106,12 +113,9 @@ impl<'a> Processes<'a> {
         }
     }
 
-    /// The last line of a process's log.
+    /// Why a process ended, if its log tells.
     pub fn last_words(&self, place: Place) -> String {
-        let text = end_of_file(&self.log(place)).unwrap_or_default();
-        let text = String::from_utf8_lossy(&text);
-        let last = text.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("it said nothing");
-        last.trim_start_matches("error: ").to_owned()
+        last_words(&self.log(place), self.log_begins_at.get(&place).copied().unwrap_or(0))
     }
 
     fn log(&self, place: Place) -> PathBuf {
@@ -139,13 +143,4 @@ fn exit(status: io::Result<ExitStatus>) -> Exit {
         // A child that cannot be waited for is as good as dead.
         Err(error) => Exit::NotStarted(error.to_string()),
     }
-}
-
-fn end_of_file(path: &Path) -> io::Result<Vec<u8>> {
-    let mut file = File::open(path)?;
-    let len = file.metadata()?.len();
-    file.seek(SeekFrom::Start(len.saturating_sub(LAST_WORDS_BYTES)))?;
-    let mut bytes = Vec::new();
-    file.read_to_end(&mut bytes)?;
-    Ok(bytes)
 }

@@ -1,13 +1,18 @@
 //! Where the view goes: the whole terminal, redrawn in place, or plain lines where there is none.
 
 use super::{model::Model, view};
-use crate::{failure::Failure, progress::PLAIN_EVERY, report};
+use crate::{
+    failure::Failure,
+    output::{self, Reader},
+    progress::PLAIN_EVERY,
+    report,
+};
 use ratatui::{
     DefaultTerminal,
     crossterm::event::{self, Event, KeyCode, KeyEvent, KeyModifiers},
 };
 use std::{
-    io::{self, IsTerminal as _, Write as _},
+    io::{self, IsTerminal as _},
     thread,
     time::{Duration, Instant},
 };
@@ -48,22 +53,26 @@ impl Screen {
         Ok(Self::Terminal(Box::new(terminal), quits))
     }
 
-    /// Shows how the run stands. A terminal that does not take it has gone, and its signal ends the process.
-    pub fn show(&mut self, model: &Model) {
+    /// Shows how the run stands; says whether anybody still looks. A terminal that does not take it has gone.
+    ///
+    /// # Errors
+    /// When lines cannot be written.
+    pub fn show(&mut self, model: &Model) -> Result<Reader, Failure> {
         match self {
             Self::Terminal(terminal, _) => {
-                let _ = terminal.draw(|frame| view::draw(frame, model));
+                let drawn = terminal.draw(|frame| view::draw(frame, model));
+                Ok(if drawn.is_ok() { Reader::There } else { Reader::Gone })
             }
             Self::Plain { printed, happened } => {
                 let new = model.happened.saturating_sub(std::mem::replace(happened, model.happened));
                 let known = model.happenings.len();
-                for happening in model.happenings.iter().skip(known.saturating_sub(new)) {
-                    print(&view::happening(happening));
-                }
+                let news = model.happenings.iter().skip(known.saturating_sub(new));
+                let mut lines: Vec<_> = news.map(view::happening).collect();
                 if !model.away && printed.is_none_or(|printed| printed.elapsed() >= PLAIN_EVERY) {
                     *printed = Some(Instant::now());
-                    print(&report::status_line(&model.status));
+                    lines.push(report::status_line(&model.status));
                 }
+                output::print(&lines.into_iter().map(|line| line + "\n").collect::<String>())
             }
         }
     }
@@ -86,8 +95,12 @@ impl Screen {
 
     /// Gives the terminal back.
     pub fn close(self) {
-        if matches!(self, Self::Terminal(..)) {
-            ratatui::restore();
+        if let Self::Terminal(mut terminal, _) = self {
+            // Each of these may fail because the terminal has gone: then there is nothing to give back.
+            let _ = terminal.show_cursor();
+            let _ = ratatui::try_restore();
+            // Its end would show the cursor again, and print where it cannot.
+            std::mem::forget(terminal);
         }
     }
 }
@@ -101,9 +114,4 @@ fn is_quit(event: &Event) -> bool {
         Event::Key(KeyEvent { code, .. }) => matches!(code, KeyCode::Char('q') | KeyCode::Esc),
         _ => false,
     }
-}
-
-/// Prints a line. Whoever reads the lines may stop reading.
-pub fn print(line: &str) {
-    let _ = writeln!(io::stdout(), "{line}");
 }

@@ -119,7 +119,8 @@ impl Train {
             let answer = self.ctl(&["status"]);
             if answer.status.success() {
                 let status: Value = serde_json::from_slice(&answer.stdout).unwrap();
-                if wanted(&status) {
+                // Of a run that goes on from its end, until its learner answers.
+                if status["state"] != "over" && wanted(&status) {
                     return status;
                 }
             }

@@ -1,0 +1,38 @@
+//! What commands print, and what becomes of it where it cannot be written.
+//!
+//! The standard library's print macros panic there; nothing here does. A closed pipe means that whoever read has had
+//! enough, and is no failure; a full disk is one.
+
+use crate::failure::Failure;
+use std::io::{self, ErrorKind, Write as _};
+
+/// Whether anybody still reads what is printed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reader {
+    /// As far as one can tell.
+    There,
+    /// It has closed its end of the pipe.
+    Gone,
+}
+
+/// Prints a command's result on standard output, as it is.
+///
+/// # Errors
+/// When somebody would read it and it cannot be written, as on a full disk.
+pub fn print(text: &str) -> Result<Reader, Failure> {
+    let mut stdout = io::stdout().lock();
+    match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
+        Ok(()) => Ok(Reader::There),
+        Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(Reader::Gone),
+        Err(error) => Err(Failure::runtime_message(format!("cannot write to standard output: {error}"))),
+    }
+}
+
+/// Says something beside a command's result, as a line on standard error.
+///
+/// # Errors
+/// When it cannot be written. Mostly that is to be ignored: who would be told?
+pub fn say(line: &str) -> io::Result<()> {
+    // In one piece, so that lines of several processes on one terminal do not mix.
+    io::stderr().lock().write_all(format!("{line}\n").as_bytes())
+}

@@ -1,0 +1,159 @@
+//! What was typed and is no command line, in one line of words.
+
+use crate::{cli::Cli, failure::Failure, output};
+use clap::{
+    CommandFactory as _, Error,
+    error::{ContextKind, ContextValue, ErrorKind},
+};
+use std::{
+    io::{self, IsTerminal as _},
+    process::ExitCode,
+};
+
+/// Prints the help that was asked for, or says what is wrong; returns the exit code.
+pub fn report(error: &Error) -> ExitCode {
+    if error.use_stderr() {
+        let words = words(error, std::env::args().skip(1));
+        return Failure::input_message(words).report();
+    }
+    let text = error.render();
+    let text = if io::stdout().is_terminal() { text.ansi().to_string() } else { text.to_string() };
+    output::print(&text).map_or_else(|failure| failure.report(), |_| ExitCode::SUCCESS)
+}
+
+/// What is wrong with these arguments.
+fn words(error: &Error, mut arguments: impl Iterator<Item = String>) -> String {
+    let names = commands();
+    let command = arguments.find(|argument| names.contains(argument));
+    let help = command.as_ref().map_or_else(|| "rit --help".to_owned(), |name| format!("rit {name} --help"));
+    let context = |kind| match error.get(kind) {
+        Some(ContextValue::String(text)) => Some(text.clone()),
+        Some(ContextValue::Strings(texts)) => Some(texts.join(", ")),
+        _ => None,
+    };
+    let argument = context(ContextKind::InvalidArg).unwrap_or_default();
+    match error.kind() {
+        ErrorKind::UnknownArgument => {
+            let suggested = context(ContextKind::SuggestedArg);
+            let advice = suggested.map(|option| format!("did you mean {option}?"));
+            let advice = advice.or_else(|| key_advice(&argument, command.as_deref()));
+            format!("unknown option {argument}; {}", advice.unwrap_or_else(|| format!("`{help}` lists them")))
+        }
+        ErrorKind::ValueValidation => {
+            let value = context(ContextKind::InvalidValue).unwrap_or_default();
+            let why = std::error::Error::source(error).map_or_else(String::new, |why| format!(": {why}"));
+            format!("{} {value:?}{why}", option(&argument))
+        }
+        ErrorKind::InvalidValue => {
+            let value = context(ContextKind::InvalidValue).unwrap_or_default();
+            let option = option(&argument);
+            match context(ContextKind::ValidValue) {
+                _ if value.is_empty() => format!("{option} needs a value; `{help}` says which"),
+                Some(choices) => format!("{option} {value:?} is none of its choices: {choices}"),
+                None => format!("{option} {value:?} will not do; `{help}` says what will"),
+            }
+        }
+        ErrorKind::InvalidSubcommand => {
+            let command = context(ContextKind::InvalidSubcommand).unwrap_or_default();
+            let suggested = context(ContextKind::SuggestedSubcommand);
+            let advice = suggested.map(|name| format!("did you mean {name}?"));
+            format!(
+                "unknown command {command:?}; {}",
+                advice.unwrap_or_else(|| format!("`{help}` lists them"))
+            )
+        }
+        ErrorKind::MissingRequiredArgument => format!("{argument} is missing; `{help}` explains it"),
+        ErrorKind::MissingSubcommand | ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => {
+            format!("which command? `{help}` lists them")
+        }
+        ErrorKind::ArgumentConflict => {
+            let other = context(ContextKind::PriorArg).unwrap_or_default();
+            format!("{argument} and {other} do not go together")
+        }
+        _ => first_paragraph(&error.render().to_string()),
+    }
+}
+
+/// Names of the commands.
+fn commands() -> Vec<String> {
+    Cli::command().get_subcommands().map(|command| command.get_name().to_owned()).collect()
+}
+
+/// An option without what stands for its value: `--steps <N>` is `--steps`.
+fn option(argument: &str) -> &str {
+    argument.split(' ').next().unwrap_or(argument)
+}
+
+/// How to set the key of the configuration that was meant, where the command takes any.
+fn key_advice(argument: &str, command: Option<&str>) -> Option<String> {
+    let root = Cli::command();
+    let takes_keys =
+        root.find_subcommand(command?)?.get_arguments().any(|option| option.get_id() == "settings");
+    let name = option(argument).trim_start_matches('-');
+    let key = rit_config::key_like(name).filter(|_| takes_keys)?;
+    Some(format!("a key is set with --set {key}=VALUE"))
+}
+
+/// What clap says before it comes to usage and tips, in one line.
+fn first_paragraph(text: &str) -> String {
+    let lines = text.lines().map(str::trim).take_while(|line| !line.is_empty());
+    let words = lines.collect::<Vec<_>>().join(" ");
+    words.trim_start_matches("error: ").to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser as _;
+
+    fn refused(arguments: &[&str]) -> String {
+        let error = Cli::try_parse_from([&["rit"], arguments].concat()).unwrap_err();
+        words(&error, arguments.iter().map(|&argument| argument.to_owned()))
+    }
+
+    #[test]
+    fn every_mistake_is_one_line_that_names_it_and_the_remedy() {
+        for (arguments, message) in [
+            (
+                &["train", "x", "--lr", "0.1"][..],
+                "unknown option --lr; a key is set with --set algorithm.lr=VALUE",
+            ),
+            (
+                &["train", "x", "--batch-size=5"],
+                "unknown option --batch-size; a key is set with --set algorithm.batch_size=VALUE",
+            ),
+            (&["plot", "x", "--lr"], "unknown option --lr; `rit plot --help` lists them"),
+            (&["train", "x", "--step", "5"], "unknown option --step; did you mean --steps?"),
+            (&["train", "x", "--zzz"], "unknown option --zzz; `rit train --help` lists them"),
+            (
+                &["train", "x", "--steps", "lots"],
+                "--steps \"lots\": write a whole number, such as 1000000, 1_000_000, 1e6, 100k or 2M",
+            ),
+            (&["train", "x", "--steps", "32.0"], "--steps \"32.0\": write a whole number: 32"),
+            (
+                &["train", "x", "--seed", "18446744073709551615"],
+                "--seed \"18446744073709551615\": it is out of range 0..=9223372036854775807",
+            ),
+            (&["train", "x", "--actors=-1"], "--actors \"-1\": write a whole number of at least 0"),
+            (&["render", "--episodes", "21"], "--episodes \"21\": it is out of range 1..=20"),
+            (&["plot", "x", "--out", "y", "--line", "nan"], "--line \"nan\": write a number, such as -12.5"),
+            (
+                &["train", "x", "--log-format", "xml"],
+                "--log-format \"xml\" is none of its choices: human, json",
+            ),
+            (&["train", "x", "--steps"], "--steps needs a value; `rit train --help` says which"),
+            (&["trian"], "unknown command \"trian\"; did you mean train?"),
+            (&["plot", "x"], "--out <FILE> is missing; `rit plot --help` explains it"),
+            (&["train"], "<EXPERIMENT> is missing; `rit train --help` explains it"),
+            (&["train", "--resume", "x", "--seed", "5"], "--resume <DIR> and --seed <N> do not go together"),
+            (&[], "which command? `rit --help` lists them"),
+        ] {
+            assert_eq!(refused(arguments), message, "{arguments:?}");
+        }
+    }
+
+    #[test]
+    fn the_command_line_is_one_that_clap_understands() {
+        Cli::command().debug_assert();
+    }
+}
