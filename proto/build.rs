@@ -21,6 +21,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         .message_attribute("rit.v1.CheckpointResponse", SERIALIZE)
         .message_attribute("rit.v1.CheckpointsStatus", SERIALIZE)
         .message_attribute("rit.v1.Happening", SERIALIZE)
+        .message_attribute("rit.v1.Measure", SERIALIZE)
         .message_attribute("rit.v1.MetricsLine", SERIALIZE)
         .message_attribute("rit.v1.Rates", SERIALIZE)
         .message_attribute("rit.v1.Training", SERIALIZE)

@@ -192,11 +192,8 @@ fn status(status: &RunStatus, as_json: bool) -> Result<String, Failure> {
             report::duration(actors_waited)
         ),
         format!("epsilon            {:.3}", status.epsilon),
-        format!(
-            "losses             TD {:.4}, contrastive {:.4}, gradient norm {:.4}",
-            status.td_loss, status.contrastive_loss, status.grad_norm
-        ),
     ];
+    lines.extend(status.measures.iter().map(|it| format!("{:18} {:.4}", report::words(&it.name), it.value)));
     if let Some(ledger) = &status.ledger {
         let rejected: u64 = ledger.rejected.values().sum();
         lines.push(format!(

@@ -92,16 +92,16 @@ pub fn line(line: &MetricsLine) -> String {
         None => format!("greedy: {words}"),
     }));
     if let Some(training) = &line.training {
-        parts.push(format!(
-            "TD {:.4}, contrastive {:.4}, gradient norm {:.3}, Q {:.2}, epsilon {:.3}",
-            training.td_loss,
-            training.contrastive_loss,
-            training.grad_norm,
-            training.q_total_mean,
-            training.epsilon
-        ));
+        let epsilon = format!("epsilon {:.3}", training.epsilon);
+        let measures = training.measures.iter().map(|it| format!("{} {:.4}", words(&it.name), it.value));
+        parts.push(measures.chain([epsilon]).collect::<Vec<_>>().join(", "));
     }
     parts.join(" · ")
+}
+
+/// The name of a measure as people read it.
+pub fn words(name: &str) -> String {
+    name.replace('_', " ")
 }
 
 /// A number with thin groups of three digits.

@@ -42,7 +42,9 @@ fn a_follower_gets_every_line_until_the_run_is_over() {
         for key in ["env_steps", "episodes", "updates", "wall_s"] {
             assert_eq!(line[key], written[key], "{key}");
         }
-        assert_eq!(line["training"]["td_loss"], written["td_loss"]);
+        for measure in line["training"]["measures"].as_array().into_iter().flatten() {
+            assert_eq!(measure["value"], written[measure["name"].as_str().unwrap()], "{measure}");
+        }
         for task in line["tasks"].as_array().unwrap() {
             let name = task["task"].as_str().unwrap();
             for key in ["episodes", "mean_return", "win_rate", "episodes_total", "policy_lag"] {
@@ -133,7 +135,7 @@ fn people_get_lines() {
     let text = String::from_utf8(printed.stdout).unwrap();
     assert!(text.lines().count() > 10, "{text}");
     assert!(text.starts_with("0 steps · 0 updates · greedy: return "), "{text}");
-    assert!(text.contains("TD ") && text.contains("epsilon 0."), "{text}");
+    assert!(text.contains("td loss ") && text.contains("epsilon 0."), "{text}");
     train.ctl(&["stop"]);
     train.finish();
 }

@@ -14,6 +14,7 @@ use crate::{
     trainer::{Beginning, News, Standing, Work},
     writer::CheckpointEnded,
 };
+use rit_algo::learner::Measure;
 use rit_config::Config;
 use rit_episode::{Episode, wire};
 use rit_proto::v1::{self, LearnerMessage, learner_message::Message};
@@ -113,6 +114,8 @@ pub struct Coordinator {
     /// The run ends when nothing is under way any more.
     draining: bool,
     standing: Standing,
+    /// What updates report.
+    measures: &'static [Measure],
     epsilon: f32,
     frames_refused: BTreeMap<&'static str, u64>,
     /// Frames that were read, refused ones too.
@@ -142,13 +145,14 @@ impl Coordinator {
         work: mpsc::Sender<Work>,
         fences: mpsc::Sender<Fence>,
     ) -> Self {
-        let Beginning { batches, terms, standing, warnings } = beginning;
+        let Beginning { batches, terms, standing, measures, warnings } = beginning;
         let started = Instant::now();
         let mut happenings = Happenings::new(started);
         warnings.into_iter().for_each(|what| happenings.warn(standing.progress.env_steps, what));
         Self {
             epsilon: config.epsilon(standing.progress.env_steps),
             standing,
+            measures,
             ledger: Ledger::new(config.algorithm.n_rollout_threads, batches, terms),
             actors: BTreeMap::new(),
             next_actor: 0,

@@ -1,6 +1,7 @@
 //! What an update reported, by the names that its method gives.
 
 use rit_algo::learner::Measure;
+use rit_proto::v1;
 use serde::{
     Deserialize, Deserializer, Serialize, Serializer,
     de::{MapAccess, Visitor},
@@ -19,9 +20,16 @@ impl Measured {
         Self(named.map(|(measure, &value)| (measure.name.to_owned(), value)).collect())
     }
 
-    /// The value of a name.
-    pub fn get(&self, name: &str) -> Option<f64> {
-        self.0.iter().find(|(known, _)| known == name).map(|&(_, value)| value)
+    /// As messages, with what each is according to `measures`.
+    pub fn to_messages(&self, measures: &[Measure]) -> Vec<v1::Measure> {
+        let help =
+            |name: &str| measures.iter().find(|measure| measure.name == name).map(|measure| measure.help);
+        let message = |(name, value): &(String, f64)| v1::Measure {
+            name: name.clone(),
+            value: *value,
+            help: help(name).unwrap_or_default().to_owned(),
+        };
+        self.0.iter().map(message).collect()
     }
 }
 
@@ -76,6 +84,9 @@ mod tests {
         let text = serde_json::to_string(&line).unwrap();
         assert_eq!(text, r#"{"env_steps":7,"td_loss":0.5,"grad_norm":1e-9}"#);
         assert_eq!(serde_json::from_str::<Line>(&text).unwrap(), line);
-        assert_eq!((line.measured.get("grad_norm"), line.measured.get("q")), (Some(1e-9), None));
+        let measures = [Measure { name: "grad_norm", help: "Gradient norm" }];
+        let messages = line.measured.to_messages(&measures);
+        let told: Vec<_> = messages.iter().map(|it| (it.name.as_str(), it.value, it.help.as_str())).collect();
+        assert_eq!(told, [("td_loss", 0.5, ""), ("grad_norm", 1e-9, "Gradient norm")]);
     }
 }

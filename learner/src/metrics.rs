@@ -143,14 +143,9 @@ impl Line {
             ..result.to_message()
         };
         let training = match self {
-            Self::Training { epsilon, measured, .. } => Some(v1::Training {
-                epsilon: *epsilon,
-                td_loss: measured.get("td_loss").unwrap_or_default(),
-                contrastive_loss: measured.get("contrastive_loss").unwrap_or_default(),
-                grad_norm: measured.get("grad_norm").unwrap_or_default(),
-                q_total_mean: measured.get("q_total_mean").unwrap_or_default(),
-                target_mean: measured.get("target_mean").unwrap_or_default(),
-            }),
+            Self::Training { epsilon, measured, .. } => {
+                Some(v1::Training { epsilon: *epsilon, measures: measured.to_messages(&[]) })
+            }
             Self::Evaluation { .. } => None,
         };
         v1::MetricsLine {
@@ -343,7 +338,8 @@ mod tests {
         let message = line(9).to_message();
         let training = message.training.unwrap();
         assert_eq!((message.env_steps, message.episodes, message.updates), (9, 3, 2));
-        assert_eq!((training.td_loss, training.target_mean, training.epsilon), (1e-9, -3.0, 0.1 + 0.2));
+        let measures: Vec<_> = training.measures.iter().map(|it| (it.name.as_str(), it.value)).collect();
+        assert_eq!((measures, training.epsilon), (vec![("td_loss", 1e-9), ("target_mean", -3.0)], 0.1 + 0.2));
         let [task] = &message.tasks[..] else { panic!("{:?}", message.tasks) };
         assert_eq!((task.task.as_str(), task.episodes, task.policy_lag), ("game-1", 5, Some(1)));
     }

@@ -104,14 +104,17 @@ fn run(status: &RunStatus) -> Vec<Family<'_>> {
 
 fn training(status: &RunStatus) -> Vec<Family<'_>> {
     let waiting = "Training waited for episodes while the run was not paused";
+    let measures = status.measures.iter().map(|it| (Some(("measure", it.name.as_str())), it.value));
     let (held, held_max) = (status.replay_episodes as f64, status.replay_episodes_max as f64);
     vec![
         one(Gauge, "epsilon", "Probability of a random action", status.epsilon),
-        one(Gauge, "td_loss", "TD loss of the last update", status.td_loss),
-        one(Gauge, "contrastive_loss", "Contrastive loss of the last update", status.contrastive_loss),
-        one(Gauge, "gradient_norm", "Gradient norm of the last update before clipping", status.grad_norm),
-        one(Gauge, "q_total_mean", "Mean Q_total of the last update", status.q_total_mean),
-        one(Gauge, "target_mean", "Mean TD target of the last update", status.target_mean),
+        Family {
+            kind: Gauge,
+            name: "measure",
+            help: "What the last update reported, by name",
+            unit: None,
+            samples: measures.collect(),
+        },
         one(Gauge, "replay_episodes", "Episodes in replay", held),
         one(Gauge, "replay_episodes_max", "Episodes that replay can hold", held_max),
         one(Counter, "learner_waiting", waiting, status.learner_waiting_s).in_unit(Unit::Seconds),
@@ -224,7 +227,7 @@ fn by_reason<'a>(name: &'static str, help: &'static str, counts: &'a HashMap<Str
 #[cfg(test)]
 mod tests {
     use super::*;
-    use rit_proto::v1::{CheckpointsStatus, Evaluation, LedgerStatus, Rates};
+    use rit_proto::v1::{CheckpointsStatus, Evaluation, LedgerStatus, Measure, Rates};
     use std::{collections::HashSet, fs, path::Path};
 
     fn status() -> RunStatus {
@@ -236,6 +239,7 @@ mod tests {
             policy_lag: lag,
             ..TaskResult::default()
         };
+        let measure = |(name, value): (&str, f64)| Measure { name: name.into(), value, ..Measure::default() };
         RunStatus {
             state: RunState::Paused.into(),
             env_steps: 5_050_000,
@@ -257,6 +261,7 @@ mod tests {
                 ..LedgerStatus::default()
             }),
             learner_waiting_s: 1.25,
+            measures: [("td_loss", 0.5), ("role_kl", 0.25)].map(measure).to_vec(),
             shared_memory_bytes: 1 << 40,
             checkpoints: Some(CheckpointsStatus { written: 2, total_s: 0.75, ..Default::default() }),
             ..RunStatus::default()
@@ -298,6 +303,8 @@ mod tests {
             (r#"rit_state{state="running"}"#, 0.0),
             ("rit_env_steps_total", 5_050_000.0),
             ("rit_updates_per_second", 12.5),
+            (r#"rit_measure{measure="td_loss"}"#, 0.5),
+            (r#"rit_measure{measure="role_kl"}"#, 0.25),
             (r#"rit_exploring_return{task="4v4"}"#, -1.5),
             (r#"rit_exploring_win_rate{task="3v3"}"#, 0.25),
             (r#"rit_evaluation_win_rate{task="3v3"}"#, 0.5),

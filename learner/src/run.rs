@@ -138,6 +138,7 @@ pub async fn run(
     let news = Box::new(move |what| {
         let _ = news.blocking_send(Event::News(what));
     });
+    let measures = learner.measures();
     let loaded = load(&run_dir, &*learner, &expected, &config)?;
     let episodes = loaded.as_ref().map_or(0, |loaded| loaded.state.manifest.progress.episodes);
     let writer = Writer {
@@ -175,7 +176,8 @@ pub async fn run(
         })?
     };
 
-    let handle = RunHandle::new(events.clone(), board.clone(), config, run_dir.clone(), model, set_log);
+    let handle =
+        RunHandle::new(events.clone(), board.clone(), config, run_dir.clone(), model, measures, set_log);
     let mut serving_web = JoinSet::new();
     if let Some(web) = web {
         tracing::info!(address = %web.address(), "the web page is served");

@@ -6,7 +6,7 @@ use crate::{
     trainer::{Checkpointed, evaluation_seed},
     weights::{Snapshot, WeightsBoard},
 };
-use rit_algo::{Acting, Model};
+use rit_algo::{Acting, Model, learner::Measure};
 use rit_config::{Config, ConfigError, RunDir, RunDirError, set, set_live};
 use rit_env::{Scene, TaskError, rollout::LostEpisode};
 use rit_episode::{Episode, RunSeed};
@@ -80,6 +80,7 @@ pub struct RunHandle {
     run_dir: RunDir,
     set_log: SetLog,
     model: Arc<Model>,
+    measures: &'static [Measure],
     /// One caller's episodes at a time: training goes on beside them.
     rollouts: Arc<Semaphore>,
 }
@@ -92,6 +93,7 @@ impl RunHandle {
         config: Config,
         run_dir: RunDir,
         model: Arc<Model>,
+        measures: &'static [Measure],
         set_log: SetLog,
     ) -> Self {
         let config = watch::Sender::new(Arc::new(config));
@@ -104,8 +106,14 @@ impl RunHandle {
             run_dir,
             set_log,
             model,
+            measures,
             rollouts: Arc::new(Semaphore::new(1)),
         }
+    }
+
+    /// What the run's updates report.
+    pub fn measures(&self) -> &'static [Measure] {
+        self.measures
     }
 
     /// The run's configuration as it is now.

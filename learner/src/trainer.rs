@@ -15,7 +15,7 @@ use crate::{
 };
 use rit_algo::{
     Acting, Learner, Regime,
-    learner::{Draw, NamedState, NotFinite, StateError},
+    learner::{Draw, Measure, NamedState, NotFinite, StateError},
 };
 use rit_config::{Config, RunDir, Until};
 use rit_env::{Split, rollout::LostEpisode};
@@ -165,6 +165,8 @@ pub struct Beginning {
     pub terms: Vec<Terms>,
     /// How training stands.
     pub standing: Standing,
+    /// What its updates report.
+    pub measures: &'static [Measure],
     /// What somebody should know of it.
     pub warnings: Vec<String>,
 }
@@ -226,6 +228,7 @@ impl Trainer {
             batches: self.standing.progress.episodes / self.config.algorithm.n_rollout_threads as u64,
             terms: self.terms.iter().copied().collect(),
             standing: self.standing.clone(),
+            measures: self.learner.measures(),
             warnings: self.warnings.clone(),
         }
     }

@@ -1,6 +1,6 @@
 //! What is known of the run that is watched.
 
-use rit_proto::v1::{Happening, MetricsLine, RunStatus};
+use rit_proto::v1::{Happening, Measure, MetricsLine, RunStatus};
 use std::collections::VecDeque;
 
 /// Lines of metrics that curves go back.
@@ -9,13 +9,13 @@ pub const HISTORY: usize = 60;
 /// A number over the last lines of metrics.
 #[derive(Debug)]
 pub struct Curve {
-    pub name: &'static str,
+    pub name: String,
     pub values: VecDeque<f64>,
 }
 
 impl Curve {
-    fn new(name: &'static str) -> Self {
-        Self { name, values: VecDeque::with_capacity(HISTORY) }
+    fn new(name: &str) -> Self {
+        Self { name: name.to_owned(), values: VecDeque::with_capacity(HISTORY) }
     }
 
     fn push(&mut self, value: f64) {
@@ -44,7 +44,8 @@ pub struct Model {
     pub status: RunStatus,
     /// Whether its learner is away.
     pub away: bool,
-    pub curves: [Curve; 4],
+    /// Of what the run's updates report, in the order in which it came.
+    pub curves: Vec<Curve>,
     /// Of all learners that were watched, the newest last.
     pub happenings: VecDeque<Happening>,
     /// How many there ever were.
@@ -61,7 +62,7 @@ impl Model {
             name,
             status: RunStatus::default(),
             away: false,
-            curves: ["TD loss", "contrastive loss", "gradient norm", "mean Q_total"].map(Curve::new),
+            curves: Vec::new(),
             happenings: VecDeque::new(),
             happened: 0,
             known_until_s: f64::NEG_INFINITY,
@@ -78,8 +79,14 @@ impl Model {
     pub fn line(&mut self, line: &MetricsLine) {
         self.next_env_steps = self.next_env_steps.max(line.env_steps + 1);
         let Some(training) = &line.training else { return };
-        let values = [training.td_loss, training.contrastive_loss, training.grad_norm, training.q_total_mean];
-        self.curves.iter_mut().zip(values).for_each(|(curve, value)| curve.push(value));
+        for Measure { name, value, .. } in &training.measures {
+            let known = self.curves.iter().position(|curve| curve.name == *name);
+            let index = known.unwrap_or_else(|| {
+                self.curves.push(Curve::new(name));
+                self.curves.len() - 1
+            });
+            self.curves[index].push(*value);
+        }
     }
 
     /// Takes a status in.
@@ -144,9 +151,10 @@ mod tests {
         let what: Vec<_> = model.happenings.iter().map(|happening| happening.what.as_str()).collect();
         assert_eq!(what, ["a", "b", "the learner has gone; waiting for it to come back", "c"]);
 
+        let measure = |value| Measure { name: "td_loss".into(), value, ..Measure::default() };
         let line = |env_steps| MetricsLine {
             env_steps,
-            training: Some(Training { td_loss: env_steps as f64, ..Training::default() }),
+            training: Some(Training { measures: vec![measure(env_steps as f64)], ..Training::default() }),
             ..MetricsLine::default()
         };
         model.line(&line(10));

@@ -1,7 +1,7 @@
 //! How a run looks on a terminal.
 
 use super::model::{Curve, Model};
-use crate::report::{duration, grouped, state, time_left};
+use crate::report::{duration, grouped, state, time_left, words};
 use ratatui::{
     Frame,
     layout::{Constraint, Layout, Rect},
@@ -114,7 +114,8 @@ fn numbers_of(status: &RunStatus) -> Vec<Line<'static>> {
 
 fn curve_line(curve: &Curve, width: usize) -> Line<'static> {
     let newest = curve.values.back().map_or_else(|| "-".to_owned(), |value| format!("{value:.4}"));
-    Line::from_iter([format!("{:18}{newest:>12}  ", curve.name).into(), curve.sparkline(width).cyan()])
+    let name = words(&curve.name);
+    Line::from_iter([format!("{name:18}{newest:>12}  ").into(), curve.sparkline(width).cyan()])
 }
 
 fn actor_table(status: &RunStatus) -> Table<'static> {
@@ -158,7 +159,7 @@ fn ledger_of(status: &RunStatus) -> String {
 mod tests {
     use super::*;
     use ratatui::{Terminal, backend::TestBackend};
-    use rit_proto::v1::{Evaluation, LedgerStatus, MetricsLine, Rates, Training};
+    use rit_proto::v1::{Evaluation, LedgerStatus, Measure, MetricsLine, Rates, Training};
 
     fn model() -> Model {
         let result = |task: &str, mean_return, win_rate| TaskResult {
@@ -179,7 +180,8 @@ mod tests {
         };
         let mut model = Model::new("matrix-game-1".into());
         for step in 0..9 {
-            let training = Some(Training { td_loss: f64::from(step), ..Training::default() });
+            let measure = Measure { name: "td_loss".into(), value: f64::from(step), ..Measure::default() };
+            let training = Some(Training { measures: vec![measure], ..Training::default() });
             model.line(&MetricsLine { env_steps: 10, training, ..MetricsLine::default() });
         }
         model.status(RunStatus {
@@ -221,7 +223,7 @@ mod tests {
             "game-1           88.00     0.50      -         -         1 234       1",
             "game-2           -3.25     0.00      94.00     1.00      1 234       1",
             "2500 steps/s",
-            "TD loss                 8.0000  ▁▂▃▄▅▅▆▇█",
+            "td loss                 8.0000  ▁▂▃▄▅▅▆▇█",
             "actor-0          77        rolling   2 000       3",
             "actor-1          77        hung      2 000       0",
             "ledger: 9 handed out = 5 inserted + 4 outstanding + 0 taken back",

@@ -15,7 +15,6 @@ impl Coordinator {
     pub(super) fn status(&self) -> v1::RunStatus {
         let Standing { progress, measured, recent, evaluation, replay_episodes } = &self.standing;
         let now = Instant::now();
-        let of = |name| measured.get(name).unwrap_or_default();
         let messages = |results: &[TaskResult]| results.iter().map(TaskResult::to_message).collect();
         // All frames of a run have the same length.
         let frame_bytes = size_of::<Header>() + PayloadLayout::new(self.config.dims()).len();
@@ -27,9 +26,6 @@ impl Coordinator {
             updates: progress.updates,
             epsilon: self.epsilon.into(),
             wall_s: (now - self.started).as_secs_f64(),
-            td_loss: of("td_loss"),
-            contrastive_loss: of("contrastive_loss"),
-            grad_norm: of("grad_norm"),
             recent: messages(recent),
             evaluation: evaluation.as_ref().map(|(progress, results)| v1::Evaluation {
                 env_steps: progress.env_steps,
@@ -41,14 +37,14 @@ impl Coordinator {
             replay_episodes: *replay_episodes as u64,
             pid: std::process::id(),
             replay_episodes_max: self.config.replay_episodes() as u64,
-            q_total_mean: of("q_total_mean"),
-            target_mean: of("target_mean"),
             rates: Some(self.rates.rates()),
             learner_waiting_s: self.learner_waiting.seconds(now),
             shared_memory_bytes: self.frames * frame_bytes as u64,
             checkpoints: Some(self.checkpoints),
             happenings: self.happenings.list(),
             actors_wanted: self.config.actors.count as u32,
+            measures: measured.to_messages(self.measures),
+            algorithm: self.config.algorithm.name.to_string(),
         }
     }
 

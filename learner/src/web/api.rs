@@ -13,6 +13,7 @@ use axum::{
     response::{IntoResponse, Response},
     routing::{get, post},
 };
+use rit_algo::Regime;
 use rit_env::{BodyKind, Scene, Split, Task};
 use rit_episode::Action;
 use rit_proto::v1;
@@ -89,6 +90,13 @@ impl IntoResponse for ApiError {
     }
 }
 
+/// A number of `metrics.jsonl`, and what it is.
+#[derive(Serialize)]
+struct Measure {
+    name: &'static str,
+    help: &'static str,
+}
+
 /// What stays the same as long as a run goes.
 #[derive(Serialize)]
 struct Run {
@@ -99,6 +107,10 @@ struct Run {
     training_tasks: Vec<String>,
     testing_tasks: Vec<String>,
     has_wins: bool,
+    /// What its updates report.
+    measures: Vec<Measure>,
+    /// Whether some actions are random by an ε.
+    explores: bool,
     /// Whether episodes can be drawn.
     has_scenes: bool,
     evaluation_episodes: usize,
@@ -118,6 +130,13 @@ async fn run(State(page): State<Page>) -> Result<Json<Run>, ApiError> {
         training_tasks: names(Split::Training),
         testing_tasks: names(Split::Testing),
         has_wins: task_set.has_wins(),
+        explores: config.algorithm.name.facts().regime == Regime::Replay,
+        measures: page
+            .handle
+            .measures()
+            .iter()
+            .map(|&rit_algo::learner::Measure { name, help }| Measure { name, help })
+            .collect(),
         has_scenes: config.tasks(Split::Training).iter().all(|task| task.spec().has_scenes),
         evaluation_episodes: config.evaluation.episodes,
         testing_episodes: config.evaluation.testing_episodes,

@@ -6,14 +6,6 @@ import { get, listen, post } from "./feed.js";
 import { followLog, showLedger, showProcesses, showTiles, showWarnings } from "./panels.js";
 import { byId, duration, grouped, make, short } from "./text.js";
 
-/** Small charts: key in a training line, and what it is called. */
-const SMALL = [
-  ["td_loss", "TD loss"],
-  ["contrastive_loss", "Contrastive loss"],
-  ["grad_norm", "Gradient norm"],
-  ["epsilon", "Exploration ε"],
-];
-
 const NOTE_MS = 8000;
 
 const run = await get("/api/run");
@@ -24,7 +16,9 @@ let link = "lost";
 let status = null;
 
 const curve = new Chart(byId("curve"), { label: "Learning curves" });
-const small = SMALL.map(([key, name]) => {
+/** Small charts: key in a training line, and what it is called. */
+const smallCharts = [...run.measures.map(({ name, help }) => [name, help]), ...(run.explores ? [["epsilon", "Exploration ε"]] : [])];
+const small = smallCharts.map(([key, name]) => {
   const box = make("div", { class: "chart" });
   byId("small-charts").append(make("section", { class: "card" }, make("h2", {}, name), box));
   return { key, name, chart: new Chart(box, { label: name, compact: true, range: key === "epsilon" ? [0, 1] : null }) };
