@@ -4,7 +4,7 @@
 //! sees nothing gets zeros, exactly, and passes no gradient.
 
 use crate::{
-    Accum, Buffer, LayoutBuilder, Linear, Scratch, View, ViewMut, activation, for_lanes, linear,
+    Accum, Buffer, LayoutBuilder, Linear, View, ViewMut, activation, for_lanes, linear,
     math::{self, LANES, Lanes, each, load, store},
     matmul, vectorized,
 };
@@ -60,15 +60,66 @@ pub enum Visible<'a> {
     Where(&'a [u8]),
 }
 
-/// What forward leaves for backward. With Q query rows and K key rows:
-#[derive(Debug, Default)]
-pub struct AttentionState {
-    /// `[Q, a]`.
-    queries: Buffer,
-    /// Keys and values, `[K, 2a]`.
-    key_values: Buffer,
-    /// Softmax weights; the groups' `[heads, queries, masks, keys]` one after another.
-    weights: Buffer,
+/// What attention is made of. With Q query rows, K keys, H heads of width k in scores and a / H in values:
+#[derive(Clone, Copy, Debug)]
+pub struct Sides<'a> {
+    /// (Q, H k).
+    pub queries: View<'a>,
+    /// (K, H k), or (K, k) where all heads look at the same keys.
+    pub keys: View<'a>,
+    /// (K, a).
+    pub values: View<'a>,
+    /// Which row of keys and values each of the groups' keys stands for, if several may stand for one.
+    pub rows: Option<&'a [usize]>,
+    /// H.
+    pub heads: usize,
+    /// What scores are scaled with, 1/√(a / H).
+    pub scale: f32,
+}
+
+/// Gradients by [`Sides`]: those by queries are written; those by keys and by values are added to where `adds` says so,
+/// else written too, which is possible only where each key has a row of its own.
+#[derive(Debug)]
+pub struct SidesMut<'a> {
+    /// (Q, H k).
+    pub queries: ViewMut<'a>,
+    /// By keys and values.
+    pub keys: KeysMut<'a>,
+    /// Whether gradients by keys, and by values, hold contributions already.
+    pub adds: [bool; 2],
+}
+
+/// Gradients by keys and values.
+#[derive(Debug)]
+pub enum KeysMut<'a> {
+    /// Side by side, (K, 2a).
+    Together(ViewMut<'a>),
+    /// As [`Sides::keys`] and [`Sides::values`].
+    Apart(ViewMut<'a>, ViewMut<'a>),
+}
+
+impl KeysMut<'_> {
+    #[inline(always)]
+    fn keys(&mut self) -> ViewMut<'_> {
+        match self {
+            Self::Together(both) => {
+                let a = both.cols / 2;
+                both.reborrow().columns(0..a)
+            }
+            Self::Apart(keys, _) => keys.reborrow(),
+        }
+    }
+
+    #[inline(always)]
+    fn values(&mut self) -> ViewMut<'_> {
+        match self {
+            Self::Together(both) => {
+                let a = both.cols / 2;
+                both.reborrow().columns(a..2 * a)
+            }
+            Self::Apart(_, values) => values.reborrow(),
+        }
+    }
 }
 
 impl Attention {
@@ -85,108 +136,30 @@ impl Attention {
         Self { values: Values::Linear, ..Self::new(layout, name, inputs, dim, heads) }
     }
 
-    /// Queries, keys (without their bias) and values of all rows. `x_queries` (Q, h), `x_keys` (K, h).
-    pub fn project(&self, params: &[f32], x_queries: View<'_>, x_keys: View<'_>, state: &mut AttentionState) {
+    /// Queries (Q, a), and keys and values of all rows side by side, `[K, 2a]`, as attention's sides.
+    pub fn sides<'a>(&self, queries: View<'a>, key_values: View<'a>) -> Sides<'a> {
         let a = self.dim;
-        let queries = ViewMut::dense(state.queries.fit(x_queries.rows * a), a);
-        self.query.forward(params, x_queries, queries);
-        let key_values = ViewMut::dense(state.key_values.fit(x_keys.rows * 2 * a), 2 * a);
-        self.project_keys(params, x_keys, key_values);
+        let (keys, values) = (key_values.columns(0..a), key_values.columns(a..2 * a));
+        Sides { queries, keys, values, rows: None, heads: self.heads, scale: scale(self.head_dim()) }
     }
 
-    /// Writes `out` (Q, a) from what [`Attention::project`] left.
-    pub fn attend(
-        &self,
-        groups: &[Group],
-        visible: Visible<'_>,
-        state: &mut AttentionState,
-        out: ViewMut<'_>,
-    ) {
-        self.attend_masks(groups, &[visible], state, out);
-    }
-
-    /// The same queries under several masks, which share their projections and their scores. With M masks, row
-    /// `q M + i` of `out` (Q M, a) is query q's under mask i.
-    pub fn attend_masks(
-        &self,
-        groups: &[Group],
-        masks: &[Visible<'_>],
-        state: &mut AttentionState,
-        out: ViewMut<'_>,
-    ) {
-        let AttentionState { queries, key_values, weights } = state;
-        let weights = weights.fit(weights_len(groups, masks.len(), self.heads));
-        self.attend_views(View::dense(queries, self.dim), key_values, groups, masks, weights, out);
-    }
-
-    /// Takes `d_out` (Q M, a). Writes `dx_queries` (Q, h) and `dx_keys` (K, h) and adds to the parameters'
-    /// gradients.
-    #[allow(clippy::too_many_arguments, reason = "a matrix and its companions, each named")]
-    pub fn backward(
-        &self,
-        params: &[f32],
-        x_queries: View<'_>,
-        x_keys: View<'_>,
-        groups: &[Group],
-        state: &AttentionState,
-        d_out: View<'_>,
-        dx_queries: ViewMut<'_>,
-        dx_keys: ViewMut<'_>,
-        grads: &mut [f32],
-        scratch: &mut Scratch,
-    ) {
+    /// Makes gradients by values those by what stood before their ReLU, if they have one. `key_values` and their
+    /// gradients (K, 2a).
+    pub fn rectify_backward(&self, key_values: View<'_>, d_key_values: ViewMut<'_>) {
         let a = self.dim;
-        let AttentionState { queries, key_values, weights } = state;
-        // Every query and every key belongs to one group, so all of these are written.
-        let (mut d_queries, mut d_key_values) = (scratch.take(queries.len()), scratch.take(key_values.len()));
-        let d = (&mut d_queries[..], &mut d_key_values[..]);
-        self.attend_views_backward(View::dense(queries, a), key_values, groups, weights, d_out, d);
-        self.query.backward(params, x_queries, View::dense(&d_queries, a), Some(dx_queries), grads);
-        let d_key_values_view = View::dense(&d_key_values, 2 * a);
-        linear::add_column_sums(
-            d_key_values_view.columns(a..2 * a),
-            &mut self.key_value.bias_mut(grads)[a..],
-        );
-        matmul::dyt_x(d_key_values_view, x_keys, self.key_value.weight_mut(grads), Accum::Add);
-        matmul::dy_w(d_key_values_view, self.key_value.weight(params), dx_keys, Accum::Replace);
-        scratch.give(d_key_values);
-        scratch.give(d_queries);
-    }
-
-    /// [`Attention::attend_masks`] of `queries` (Q, a) and `key_values` `[K, 2a]`, keys and values side by side;
-    /// leaves the softmax `weights` for backward.
-    pub(crate) fn attend_views(
-        &self,
-        queries: View<'_>,
-        key_values: &[f32],
-        groups: &[Group],
-        masks: &[Visible<'_>],
-        weights: &mut [f32],
-        out: ViewMut<'_>,
-    ) {
-        score(queries, key_values, groups, masks, weights, self.head_dim());
-        exponentiate(weights);
-        attend(key_values, groups, weights, out, self.head_dim());
-    }
-
-    /// From `d_out` (Q M, a) to the gradients by queries `[Q, a]` and by keys and values, before the values' ReLU,
-    /// `[K, 2a]`: `d`, all of both written.
-    pub(crate) fn attend_views_backward(
-        &self,
-        queries: View<'_>,
-        key_values: &[f32],
-        groups: &[Group],
-        weights: &[f32],
-        d_out: View<'_>,
-        d: (&mut [f32], &mut [f32]),
-    ) {
-        let (a, (d_queries, d_key_values)) = (self.dim, d);
-        let d = (d_queries, &mut d_key_values[..]);
-        attend_backward(d_out, queries, key_values, groups, weights, d, self.head_dim());
         if self.values == Values::Rectified {
-            let values = View::dense(key_values, 2 * a).columns(a..2 * a);
-            activation::relu_backward(values, ViewMut::dense(d_key_values, 2 * a).columns(a..2 * a));
+            activation::relu_backward(key_values.columns(a..2 * a), d_key_values.columns(a..2 * a));
         }
+    }
+
+    /// The value layer alone, h → a, and whether ReLU follows.
+    pub fn value(&self) -> (Linear, bool) {
+        (self.key_value.output_rows(self.dim..2 * self.dim), self.values == Values::Rectified)
+    }
+
+    /// The key layer alone, h → a.
+    pub fn key(&self) -> Linear {
+        self.key_value.output_rows(0..self.dim)
     }
 
     /// Size of one head.
@@ -194,8 +167,9 @@ impl Attention {
         self.dim / self.heads
     }
 
-    /// Keys (without their bias, which softmax does not see and whose gradient is zero) and values of `x` (K, h).
-    pub(crate) fn project_keys(&self, params: &[f32], x: View<'_>, mut key_values: ViewMut<'_>) {
+    /// Keys (without their bias, which adds the same to all scores of a query: softmax does not see it, and its gradient
+    /// is zero) and values of `x` (K, h).
+    pub fn project_keys(&self, params: &[f32], x: View<'_>, mut key_values: ViewMut<'_>) {
         let a = self.dim;
         matmul::x_wt(x, self.key_value.weight(params), key_values.reborrow(), Accum::Replace);
         let (values, bias) = (key_values.columns(a..2 * a), &self.key_value.bias(params)[a..]);
@@ -217,33 +191,40 @@ pub(crate) fn scale(head_dim: usize) -> f32 {
     1.0 / (head_dim as f32).sqrt()
 }
 
+/// `out` (Q M, a) under M masks, row `q M + i` being query q's under mask i, and the softmax weights for backward.
+pub fn forward(
+    sides: Sides<'_>,
+    groups: &[Group],
+    masks: &[Visible<'_>],
+    weights: &mut [f32],
+    out: ViewMut<'_>,
+) {
+    score(sides, groups, masks, weights);
+    exponentiate(weights);
+    attend(sides, groups, weights, out);
+}
+
 vectorized! {
     /// Every query's scores under every mask less the largest of them, group by group and head by head; −∞ where
     /// unseen.
-    fn score<'a>(
-        queries: View<'a>,
-        key_values: &'a [f32],
-        groups: &'a [Group],
-        masks: &'a [Visible<'a>],
-        scores: &'a mut [f32],
-        head_dim: usize,
-    ) {
+    fn score<'a>(sides: Sides<'a>, groups: &'a [Group], masks: &'a [Visible<'a>], scores: &'a mut [f32]) {
         let mut first = 0;
         for group in groups {
             let pairs = first..first + group.pairs();
             first = pairs.end;
-            let (keys, _) = keys_and_values(key_values, group, queries.cols);
-            let queries = queries.rows(group.queries.clone());
-            for head in heads(queries.cols, head_dim) {
+            let keys = group.keys.len();
+            let queries = sides.queries.rows(group.queries.clone());
+            for head in 0..sides.heads {
                 let scores = take(&mut scores, pairs.len() * masks.len());
-                dots(queries.columns(head.clone()), keys.columns(head), &mut scores[..pairs.len()]);
-                repeat_rows(scores, keys.rows, masks.len());
-                for (at, scores) in scores.chunks_exact_mut(keys.rows).enumerate() {
+                let of_queries = queries.columns(sides.query_columns(head));
+                dots(of_queries, sides.keys_of(group, head), &mut scores[..pairs.len()]);
+                repeat_rows(scores, keys, masks.len());
+                for (at, scores) in scores.chunks_exact_mut(keys).enumerate() {
                     let (query, seen) = (at / masks.len(), masks[at % masks.len()].flags(&pairs));
                     let mut largest = f32::NEG_INFINITY;
                     for (key, score) in scores.iter_mut().enumerate() {
-                        let sees = seen.is_none_or(|seen| seen[query * keys.rows + key] != 0);
-                        *score = if sees { scale(head_dim) * *score } else { f32::NEG_INFINITY };
+                        let sees = seen.is_none_or(|seen| seen[query * keys + key] != 0);
+                        *score = if sees { sides.scale * *score } else { f32::NEG_INFINITY };
                         largest = largest.max(*score);
                     }
                     // Who sees nothing keeps −∞, which less itself is no number.
@@ -267,80 +248,132 @@ vectorized! {
 
 vectorized! {
     /// Makes softmax weights of exponentials, in place, and `out` of the values by these weights.
-    fn attend<'a>(
-        key_values: &'a [f32],
-        groups: &'a [Group],
-        weights: &'a mut [f32],
-        out: ViewMut<'a>,
-        head_dim: usize,
-    ) {
+    fn attend<'a>(sides: Sides<'a>, groups: &'a [Group], weights: &'a mut [f32], out: ViewMut<'a>) {
         let masks = masks(groups, out.rows);
         for group in groups {
-            let (_, values) = keys_and_values(key_values, group, out.cols);
-            for head in heads(out.cols, head_dim) {
+            for head in 0..sides.heads {
                 let weights = take(&mut weights, group.pairs() * masks);
-                for weights in weights.chunks_exact_mut(values.rows) {
+                for weights in weights.chunks_exact_mut(group.keys.len()) {
                     let total: f32 = weights.iter().sum();
                     // Who sees nothing keeps the zeros.
                     if total > 0.0 {
                         weights.iter_mut().for_each(|weight| *weight /= total);
                     }
                 }
-                let out = out.reborrow().rows(under_masks(group, masks)).columns(head.clone());
-                blend(weights, values.columns(head), out);
+                let out = out.reborrow().rows(under_masks(group, masks)).columns(sides.value_columns(head));
+                blend(weights, sides.values_of(group, head), out);
             }
         }
     }
 }
 
 vectorized! {
-    /// From the gradient by the output to those by queries and by keys and values: `d`, all of it written. With w
-    /// the weights: d_w = d_out valueᵀ, d_score = w (d_w − Σ w d_w), d_query = d_score key, d_key = d_scoreᵀ query
-    /// and d_value = wᵀ d_out.
-    fn attend_backward<'a>(
-        d_out: View<'a>,
-        queries: View<'a>,
-        key_values: &'a [f32],
+    /// From the gradient by the output, `d_out` (Q M, a), to those by queries, keys and values. With w the weights: d_w
+    /// = d_out valueᵀ, d_score = w (d_w − Σ w d_w), d_query = d_score key, d_key = d_scoreᵀ query and d_value = wᵀ
+    /// d_out.
+    pub fn backward<'a>(
+        sides: Sides<'a>,
         groups: &'a [Group],
         weights: &'a [f32],
-        d: (&'a mut [f32], &'a mut [f32]),
-        head_dim: usize,
+        d_out: View<'a>,
+        d: SidesMut<'a>,
     ) {
-        let a = queries.cols;
-        let (d_queries, d_key_values) = d;
         let mut d_scores = Buffer::default();
         let masks = masks(groups, d_out.rows);
         for group in groups {
-            let (keys, values) = keys_and_values(key_values, group, a);
-            let (queries, d_out) = (queries.rows(group.queries.clone()), d_out.rows(under_masks(group, masks)));
-            let d_queries = &mut d_queries[group.queries.start * a..group.queries.end * a];
-            let d_key_values = &mut d_key_values[group.keys.start * 2 * a..group.keys.end * 2 * a];
+            let queries = sides.queries.rows(group.queries.clone());
+            let d_out = d_out.rows(under_masks(group, masks));
+            let keys = group.keys.len();
             let d_scores = d_scores.fit(group.pairs() * masks);
-            for head in heads(a, head_dim) {
+            for head in 0..sides.heads {
                 let (weights_here, behind) = weights.split_at(group.pairs() * masks);
                 weights = behind;
-                let (keys, values) = (keys.columns(head.clone()), values.columns(head.clone()));
-                let (queries, d_out) = (queries.columns(head.clone()), d_out.columns(head.clone()));
-                dots(d_out, values, d_scores);
-                for (d_scores, weights) in
-                    d_scores.chunks_exact_mut(keys.rows).zip(weights_here.chunks_exact(keys.rows))
-                {
+                let (of_queries, of_values) = (sides.query_columns(head), sides.value_columns(head));
+                let d_out = d_out.columns(of_values.clone());
+                dots(d_out, sides.values_of(group, head), d_scores);
+                for (d_scores, weights) in d_scores.chunks_exact_mut(keys).zip(weights_here.chunks_exact(keys)) {
                     let mean: f32 = weights.iter().zip(&*d_scores).fold(0.0, |sum, (w, d)| sum + w * d);
                     for (d_score, weight) in d_scores.iter_mut().zip(weights) {
-                        *d_score = weight * (*d_score - mean) * scale(head_dim);
+                        *d_score = weight * (*d_score - mean) * sides.scale;
                     }
                 }
                 // Masks share the scores: their gradients meet before the products.
-                sum_repeated_rows(d_scores, keys.rows, masks);
+                sum_repeated_rows(d_scores, keys, masks);
                 let d_scores = &d_scores[..group.pairs()];
-                blend(d_scores, keys, ViewMut::dense(d_queries, a).columns(head.clone()));
-                let d_keys = ViewMut::dense(d_key_values, 2 * a).columns(head.clone());
-                blend_transposed(d_scores, queries, d_keys);
-                let d_values = ViewMut::dense(d_key_values, 2 * a).columns(a + head.start..a + head.end);
-                blend_transposed(weights_here, d_out, d_values);
+                let d_queries = d.queries.reborrow().rows(group.queries.clone()).columns(of_queries.clone());
+                blend(d_scores, sides.keys_of(group, head), d_queries);
+                let adds = d.adds[0] || head > 0 && sides.shares_keys();
+                let to = d.keys.keys().columns(sides.key_columns(head));
+                blend_transposed(d_scores, queries.columns(of_queries), sides.picked(group), to, adds);
+                let to = d.keys.values().columns(of_values);
+                blend_transposed(weights_here, d_out, sides.picked(group), to, d.adds[1]);
             }
         }
     }
+}
+
+/// Rows of a matrix that a group's keys stand for.
+#[derive(Clone, Copy)]
+struct Picked<'a> {
+    /// The first of them, where they follow each other.
+    first: usize,
+    /// How many.
+    len: usize,
+    /// Each by itself, where they do not.
+    rows: Option<&'a [usize]>,
+}
+
+impl Picked<'_> {
+    #[inline(always)]
+    fn row(self, key: usize) -> usize {
+        self.rows.map_or(self.first + key, |rows| rows[key])
+    }
+}
+
+impl<'a> Sides<'a> {
+    /// Whether all heads look at the same keys.
+    #[inline(always)]
+    fn shares_keys(&self) -> bool {
+        self.keys.cols < self.queries.cols
+    }
+
+    #[inline(always)]
+    fn query_columns(&self, head: usize) -> Range<usize> {
+        let width = self.queries.cols / self.heads;
+        head * width..(head + 1) * width
+    }
+
+    #[inline(always)]
+    fn key_columns(&self, head: usize) -> Range<usize> {
+        if self.shares_keys() { 0..self.keys.cols } else { self.query_columns(head) }
+    }
+
+    #[inline(always)]
+    fn value_columns(&self, head: usize) -> Range<usize> {
+        let width = self.values.cols / self.heads;
+        head * width..(head + 1) * width
+    }
+
+    #[inline(always)]
+    fn picked(&self, group: &Group) -> Picked<'a> {
+        let rows = self.rows.map(|rows| &rows[group.keys.clone()]);
+        Picked { first: group.keys.start, len: group.keys.len(), rows }
+    }
+
+    #[inline(always)]
+    fn keys_of(&self, group: &Group, head: usize) -> (View<'a>, Picked<'a>) {
+        (self.keys.columns(self.key_columns(head)), self.picked(group))
+    }
+
+    #[inline(always)]
+    fn values_of(&self, group: &Group, head: usize) -> (View<'a>, Picked<'a>) {
+        (self.values.columns(self.value_columns(head)), self.picked(group))
+    }
+}
+
+/// The picked rows one after another, for products that want them so.
+fn gathered((view, picked): (View<'_>, Picked<'_>)) -> Vec<f32> {
+    (0..picked.len).flat_map(|key| view.row(picked.row(key))).copied().collect()
 }
 
 /// One group's keys and values, (keys, a) each.
@@ -400,42 +433,65 @@ const LARGE: usize = 8;
 
 /// pairs = a bᵀ. `a` (queries, c), `b` (keys, c), `pairs` `[queries, keys]`.
 #[inline(always)]
-fn dots(a: View<'_>, b: View<'_>, pairs: &mut [f32]) {
+fn dots(a: View<'_>, (b, picked): (View<'_>, Picked<'_>), pairs: &mut [f32]) {
+    let keys = picked.len;
     if a.rows >= LARGE {
-        return matmul::x_wt(a, b, ViewMut::dense(pairs, b.rows), Accum::Replace);
+        let to = ViewMut::dense(pairs, keys);
+        if picked.rows.is_none() {
+            return matmul::x_wt(a, b.rows(picked.first..picked.first + keys), to, Accum::Replace);
+        }
+        return matmul::x_wt(a, View::dense(&gathered((b, picked)), b.cols), to, Accum::Replace);
     }
-    for (query, pairs) in pairs.chunks_exact_mut(b.rows).enumerate() {
+    for (query, pairs) in pairs.chunks_exact_mut(keys).enumerate() {
         for (key, pair) in pairs.iter_mut().enumerate() {
-            *pair = math::dot(a.row(query), b.row(key));
+            *pair = math::dot(a.row(query), b.row(picked.row(key)));
         }
     }
 }
 
 /// a = pairs b. `pairs` `[queries, keys]`, `b` (keys, c), `a` (queries, c).
 #[inline(always)]
-fn blend(pairs: &[f32], b: View<'_>, mut a: ViewMut<'_>) {
+fn blend(pairs: &[f32], (b, picked): (View<'_>, Picked<'_>), mut a: ViewMut<'_>) {
+    let keys = picked.len;
     if a.rows >= LARGE {
-        return matmul::dy_w(View::dense(pairs, b.rows), b, a, Accum::Replace);
+        let pairs = View::dense(pairs, keys);
+        if picked.rows.is_none() {
+            return matmul::dy_w(pairs, b.rows(picked.first..picked.first + keys), a, Accum::Replace);
+        }
+        return matmul::dy_w(pairs, View::dense(&gathered((b, picked)), b.cols), a, Accum::Replace);
     }
-    for (query, weights) in pairs.chunks_exact(b.rows).enumerate() {
+    for (query, weights) in pairs.chunks_exact(keys).enumerate() {
         let a = a.row(query);
         for_lanes!(0..b.cols, |at, len| {
-            store(weighted_sum(weights, 1, b, at, len), a, at, len);
+            let mut sum = [0.0; LANES];
+            for (key, &weight) in weights.iter().enumerate() {
+                let x = load(b.row(picked.row(key)), at, len);
+                sum = each(|lane| weight.mul_add(x[lane], sum[lane]));
+            }
+            store(sum, a, at, len);
         });
     }
 }
 
-/// b = pairsᵀ a. `pairs` `[queries, keys]`, `a` (queries, c), `b` (keys, c).
+/// b = pairsᵀ a, or b += pairsᵀ a where it `adds`, in the picked rows of b. `pairs` `[queries, keys]`, `a` (queries, c).
 #[inline(always)]
-fn blend_transposed(pairs: &[f32], a: View<'_>, mut b: ViewMut<'_>) {
-    if a.rows >= LARGE {
-        return matmul::dyt_x(View::dense(pairs, b.rows), a, b, Accum::Replace);
+fn blend_transposed(pairs: &[f32], a: View<'_>, picked: Picked<'_>, mut b: ViewMut<'_>, adds: bool) {
+    let keys = picked.len;
+    if a.rows >= LARGE && picked.rows.is_none() {
+        let accum = if adds { Accum::Add } else { Accum::Replace };
+        let to = b.rows(picked.first..picked.first + keys);
+        return matmul::dyt_x(View::dense(pairs, keys), a, to, accum);
     }
-    let keys = b.rows;
     for key in 0..keys {
-        let b = b.row(key);
+        let b = b.row(picked.row(key));
         for_lanes!(0..a.cols, |at, len| {
-            store(weighted_sum(&pairs[key..], keys, a, at, len), b, at, len);
+            let sum = weighted_sum(&pairs[key..], keys, a, at, len);
+            if adds {
+                let before = load(b, at, len);
+                store(each(|lane| before[lane] + sum[lane]), b, at, len);
+            } else {
+                store(sum, b, at, len);
+            }
         });
     }
 }

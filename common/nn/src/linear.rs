@@ -50,6 +50,14 @@ impl Linear {
         Self { weight, bias, inputs, outputs }
     }
 
+    /// The layer of some of its outputs alone.
+    pub fn output_rows(&self, outputs: Range<usize>) -> Self {
+        let weight =
+            self.weight.start + outputs.start * self.inputs..self.weight.start + outputs.end * self.inputs;
+        let bias = self.bias.start + outputs.start..self.bias.start + outputs.end;
+        Self { weight, bias, inputs: self.inputs, outputs: outputs.len() }
+    }
+
     /// The weight, (outputs, inputs).
     pub fn weight<'a>(&self, params: &'a [f32]) -> View<'a> {
         View::dense(&params[self.weight.clone()], self.inputs)

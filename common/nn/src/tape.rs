@@ -76,6 +76,7 @@ mod linear;
 mod members;
 mod rows;
 
+pub use attention::Over;
 pub use backward::{Backward, Gradient, Gradients};
 
 use crate::{Buffer, Scratch, View, ViewMut};
@@ -98,6 +99,12 @@ impl Var {
     pub fn columns(self, columns: Range<usize>) -> Self {
         debug_assert!(columns.start <= columns.end && columns.end <= self.cols);
         Self { first: self.first + columns.start, cols: columns.len(), ..self }
+    }
+
+    /// Both as one, where the other's columns follow its own in one matrix.
+    fn beside(self, other: Self) -> Option<Self> {
+        let follows = self.node == other.node && self.first + self.cols == other.first;
+        follows.then(|| Self { cols: self.cols + other.cols, ..self })
     }
 
     /// Numbers in it.

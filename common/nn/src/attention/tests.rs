@@ -21,6 +21,41 @@ fn seen() -> Vec<u8> {
     [1, 1, 1, 0, 1, 1, 0, 0].into_iter().chain(large).collect()
 }
 
+/// What forward leaves for backward.
+struct State {
+    queries: Vec<f32>,
+    key_values: Vec<f32>,
+    weights: Vec<f32>,
+}
+
+impl State {
+    fn sides(&self, attention: &Attention) -> Sides<'_> {
+        attention.sides(View::dense(&self.queries, DIM), View::dense(&self.key_values, 2 * DIM))
+    }
+}
+
+/// Projections, then attention under these masks.
+fn run_masks(
+    attention: &Attention,
+    params: &[f32],
+    xq: &[f32],
+    xk: &[f32],
+    masks: &[Visible<'_>],
+) -> (Vec<f32>, State) {
+    let mut state = State {
+        queries: vec![9.0; QUERIES * DIM],
+        key_values: vec![9.0; KEYS * 2 * DIM],
+        weights: vec![9.0; weights_len(&groups(), masks.len(), attention.heads)],
+    };
+    let mut out = vec![9.0; masks.len() * QUERIES * DIM];
+    attention.query.forward(params, View::dense(xq, INPUTS), ViewMut::dense(&mut state.queries, DIM));
+    let key_values = ViewMut::dense(&mut state.key_values, 2 * DIM);
+    attention.project_keys(params, View::dense(xk, INPUTS), key_values);
+    let mut weights = std::mem::take(&mut state.weights);
+    forward(state.sides(attention), &groups(), masks, &mut weights, ViewMut::dense(&mut out, DIM));
+    (out, State { weights, ..state })
+}
+
 fn unit(heads: usize) -> (Attention, usize) {
     let mut layout = LayoutBuilder::default();
     let attention = Attention::new(&mut layout, "attention", INPUTS, DIM, heads);
@@ -42,12 +77,8 @@ fn run(
     xq: &[f32],
     xk: &[f32],
     visible: Visible<'_>,
-) -> (Vec<f32>, AttentionState) {
-    let (mut out, mut state) = (vec![9.0; QUERIES * DIM], AttentionState::default());
-    let (xq, xk) = (View::dense(xq, INPUTS), View::dense(xk, INPUTS));
-    attention.project(params, xq, xk, &mut state);
-    attention.attend(&groups(), visible, &mut state, ViewMut::dense(&mut out, DIM));
-    (out, state)
+) -> (Vec<f32>, State) {
+    run_masks(attention, params, xq, xk, &[visible])
 }
 
 /// Equations 12-14, one number at a time.
@@ -100,28 +131,39 @@ fn follows_the_equations() {
     }
 }
 
-/// Gradients of queries, keys and parameters. The first two are written over, whatever lay there.
-fn backward(
+/// Gradients of queries, keys and parameters.
+fn gradients(
     attention: &Attention,
     params: &[f32],
     xq: &[f32],
     xk: &[f32],
-    state: &AttentionState,
+    state: &State,
     d_out: &[f32],
 ) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
     let (mut dxq, mut dxk, mut grads) = (vec![9.0; xq.len()], vec![9.0; xk.len()], vec![0.0; params.len()]);
-    attention.backward(
-        params,
-        View::dense(xq, INPUTS),
-        View::dense(xk, INPUTS),
-        &groups(),
-        state,
-        View::dense(d_out, DIM),
-        ViewMut::dense(&mut dxq, INPUTS),
-        ViewMut::dense(&mut dxk, INPUTS),
-        &mut grads,
-        &mut Scratch::default(),
-    );
+    let (mut d_queries, mut d_key_values) = (vec![9.0; QUERIES * DIM], vec![9.0; KEYS * 2 * DIM]);
+    let d = SidesMut {
+        queries: ViewMut::dense(&mut d_queries, DIM),
+        keys: KeysMut::Together(ViewMut::dense(&mut d_key_values, 2 * DIM)),
+        adds: [false; 2],
+    };
+    backward(state.sides(attention), &groups(), &state.weights, View::dense(d_out, DIM), d);
+    let of_values = View::dense(&state.key_values, 2 * DIM);
+    attention.rectify_backward(of_values, ViewMut::dense(&mut d_key_values, 2 * DIM));
+    // A key's bias is no one's.
+    for row in d_key_values.chunks_exact_mut(2 * DIM) {
+        linear::add_column_sums(
+            View::dense(&row[DIM..], DIM),
+            &mut attention.key_value.bias_mut(&mut grads)[DIM..],
+        );
+    }
+    let (to_queries, to_keys) = (ViewMut::dense(&mut dxq, INPUTS), ViewMut::dense(&mut dxk, INPUTS));
+    let d_queries = View::dense(&d_queries, DIM);
+    attention.query.backward(params, View::dense(xq, INPUTS), d_queries, Some(to_queries), &mut grads);
+    let d_key_values = View::dense(&d_key_values, 2 * DIM);
+    let of_weight = attention.key_value.weight_mut(&mut grads);
+    matmul::dyt_x(d_key_values, View::dense(xk, INPUTS), of_weight, Accum::Add);
+    matmul::dy_w(d_key_values, attention.key_value.weight(params), to_keys, Accum::Replace);
     (dxq, dxk, grads)
 }
 
@@ -131,7 +173,7 @@ fn who_sees_nothing_gets_exactly_zero_and_passes_no_gradient() {
     let (params, xq, xk) = (noise(1, len), noise(2, QUERIES * INPUTS), noise(3, KEYS * INPUTS));
     let (out, state) = run(&attention, &params, &xq, &xk, Visible::Where(&seen()));
     assert_eq!(out[2 * DIM..3 * DIM], [0.0; DIM]);
-    let (dxq, dxk, _) = backward(&attention, &params, &xq, &xk, &state, &noise(4, QUERIES * DIM));
+    let (dxq, dxk, _) = gradients(&attention, &params, &xq, &xk, &state, &noise(4, QUERIES * DIM));
     assert_eq!(dxq[2 * INPUTS..3 * INPUTS], [0.0; INPUTS]);
     assert_eq!(dxk[3 * INPUTS..5 * INPUTS], [0.0; 2 * INPUTS]);
 }
@@ -146,7 +188,7 @@ fn what_weighs_next_to_nothing_weighs_nothing() {
     let (_, state) = run(&attention, &params, &xq, &xk, Visible::All);
     assert!(state.weights.contains(&0.0) && state.weights.iter().all(|&w| w == 0.0 || w > 1e-21));
     let d_out: Vec<f32> = noise(4, QUERIES * DIM).iter().map(|d| 1e-6 * d).collect();
-    let (dxq, dxk, grads) = backward(&attention, &params, &xq, &xk, &state, &d_out);
+    let (dxq, dxk, grads) = gradients(&attention, &params, &xq, &xk, &state, &d_out);
     assert!([dxq, dxk, grads].concat().iter().all(|d| !d.is_subnormal()));
 }
 
@@ -162,7 +204,7 @@ fn gradients_are_the_numeric_ones() {
             out.iter().zip(&to).map(|(out, to)| f64::from(out * to)).sum()
         };
         let (_, state) = run(&attention, &params, &xq, &xk, visible);
-        let (dxq, dxk, grads) = backward(&attention, &params, &xq, &xk, &state, &to);
+        let (dxq, dxk, grads) = gradients(&attention, &params, &xq, &xk, &state, &to);
         check("params", &params, &grads, |params| loss(params, &xq, &xk));
         check("queries", &xq, &dxq, |xq| loss(&params, xq, &xk));
         check("keys", &xk, &dxk, |xk| loss(&params, &xq, xk));
@@ -180,12 +222,7 @@ fn several_masks_are_several_passes() {
         let (attention, len) = unit(heads);
         let (params, xq, xk) = (noise(1, len), noise(2, QUERIES * INPUTS), noise(3, KEYS * INPUTS));
         let to = noise(4, 3 * QUERIES * DIM);
-        let run_all = |params: &[f32], xq: &[f32], xk: &[f32]| {
-            let (mut out, mut state) = (vec![9.0; 3 * QUERIES * DIM], AttentionState::default());
-            attention.project(params, View::dense(xq, INPUTS), View::dense(xk, INPUTS), &mut state);
-            attention.attend_masks(&groups(), &masks, &mut state, ViewMut::dense(&mut out, DIM));
-            (out, state)
-        };
+        let run_all = |params: &[f32], xq: &[f32], xk: &[f32]| run_masks(&attention, params, xq, xk, &masks);
         let (out, state) = run_all(&params, &xq, &xk);
         for (mask, visible) in masks.into_iter().enumerate() {
             let (alone, _) = run(&attention, &params, &xq, &xk, visible);
@@ -199,7 +236,7 @@ fn several_masks_are_several_passes() {
         let loss = |params: &[f32], xq: &[f32], xk: &[f32]| {
             run_all(params, xq, xk).0.iter().zip(&to).map(|(out, to)| f64::from(out * to)).sum()
         };
-        let (dxq, dxk, grads) = backward(&attention, &params, &xq, &xk, &state, &to);
+        let (dxq, dxk, grads) = gradients(&attention, &params, &xq, &xk, &state, &to);
         check("params", &params, &grads, |params| loss(params, &xq, &xk));
         check("queries", &xq, &dxq, |xq| loss(&params, xq, &xk));
         check("keys", &xk, &dxk, |xk| loss(&params, &xq, xk));

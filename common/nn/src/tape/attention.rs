@@ -1,10 +1,10 @@
 //! Grouped attention on the tape, in its three parts: methods that look at the same entities through several masks make
 //! queries, keys and values once.
 
-use super::{Tape, Var};
+use super::{Backward, Gradient, Tape, Values, Var};
 use crate::{
     Accum, Attention, ViewMut,
-    attention::{self, Group, Visible},
+    attention::{self, Group, KeysMut, Sides, SidesMut, Visible},
     linear, matmul,
 };
 
@@ -15,10 +15,11 @@ impl<'a> Tape<'a> {
         let mut y = self.take(x.rows * 2 * a);
         attention.project_keys(self.params, self.view(x), ViewMut::dense(&mut y, 2 * a));
         let y = self.push(y, 2 * a);
-        let layer = attention.key_value.clone();
+        let attention = attention.clone();
         self.record(move |back| {
-            // ReLU's slope is in it already: whoever attends sees to that.
-            let Some(dy) = back.gradients.take(y) else { return };
+            let Some(mut dy) = back.gradients.take(y) else { return };
+            let layer = &attention.key_value;
+            attention.rectify_backward(back.values.view(y), dy.view_mut());
             linear::add_column_sums(dy.view().columns(a..2 * a), &mut layer.bias_mut(back.grads)[a..]);
             matmul::dyt_x(dy.view(), back.values.view(x), layer.weight_mut(back.grads), Accum::Add);
             if let Some(mut dx) = back.gradients.begin(x) {
@@ -57,37 +58,97 @@ impl<'a> Tape<'a> {
         masks: &[Visible<'a>],
         out: Var,
     ) {
-        let mut weights = self.take(attention::weights_len(groups, masks.len(), attention.heads));
+        let a = attention.dim;
+        let (keys, values) = (key_values.columns(0..a), key_values.columns(a..2 * a));
+        let (heads, head_dim) = (attention.heads, attention.head_dim());
+        self.attend_over(Over { queries, keys, values, rows: None, heads, head_dim }, groups, masks, out);
+    }
+
+    /// As [`Tape::attend_into`], of any queries, keys and values.
+    pub fn attend_over(&mut self, over: Over<'a>, groups: &'a [Group], masks: &[Visible<'a>], out: Var) {
+        let mut weights = self.take(attention::weights_len(groups, masks.len(), over.heads));
         self.write_into(out, |values, out, _| {
-            let (queries, key_values) = (values.view(queries), values.slice(key_values));
-            attention.attend_views(queries, key_values, groups, masks, &mut weights, out);
+            attention::forward(over.sides(values), groups, masks, &mut weights, out);
         });
         if !self.is_recording() {
             return self.give(weights);
         }
-        let attention = attention.clone();
         self.record(move |back| {
             let Some(d_out) = back.gradients.take(out) else { return back.stock.give(weights) };
-            // Every query and every key belongs to one group, so all of these are written.
-            let mut d_queries = back.gradients.work.take(queries.len());
-            let mut d_key_values = back.gradients.work.take(key_values.len());
-            let d = (&mut d_queries[..], &mut d_key_values[..]);
-            let (of_queries, of_keys) = (back.values.view(queries), back.values.slice(key_values));
-            attention.attend_views_backward(of_queries, of_keys, groups, &weights, d_out.view(), d);
-            back.gradients.contribute(queries, d_queries);
-            back.gradients.contribute(key_values, d_key_values);
+            over.backward(back, groups, &weights, &d_out);
             back.gradients.done(d_out);
             back.stock.give(weights);
         });
     }
 }
 
+/// What attention is made of on the tape: see [`attention::Sides`].
+#[derive(Clone, Copy, Debug)]
+pub struct Over<'a> {
+    /// (Q, H k).
+    pub queries: Var,
+    /// (K, H k), or (K, k) where all heads look at the same keys.
+    pub keys: Var,
+    /// (K, a).
+    pub values: Var,
+    /// Which row of keys and values each of the groups' keys stands for, if several may stand for one.
+    pub rows: Option<&'a [usize]>,
+    /// H.
+    pub heads: usize,
+    /// What scores are scaled by one over the root of.
+    pub head_dim: usize,
+}
+
+impl Over<'_> {
+    fn sides<'v>(&'v self, values: &'v Values<'_>) -> Sides<'v> {
+        Sides {
+            queries: values.view(self.queries),
+            keys: values.view(self.keys),
+            values: values.view(self.values),
+            rows: self.rows,
+            heads: self.heads,
+            scale: attention::scale(self.head_dim),
+        }
+    }
+
+    /// Contributes to the gradients by all three.
+    fn backward(&self, back: &mut Backward<'_>, groups: &[Group], weights: &[f32], d_out: &Gradient) {
+        let mut d_queries = back.gradients.work.take(self.queries.len());
+        let queries = ViewMut::dense(&mut d_queries, self.queries.cols);
+        let (sides, gradients) = (self.sides(&back.values), &mut back.gradients);
+        // Where several keys stand for one row, none of them may write over the others.
+        let mut begin = |x| if self.rows.is_some() { gradients.begin_adding(x) } else { gradients.begin(x) };
+        let adds = |gradient: &Gradient| gradient.accum == Accum::Add;
+        match self.keys.beside(self.values) {
+            Some(both) => {
+                let Some(mut d) = begin(both) else { return };
+                let adds = [adds(&d); 2];
+                let keys = KeysMut::Together(d.view_mut());
+                attention::backward(sides, groups, weights, d_out.view(), SidesMut { queries, keys, adds });
+                back.gradients.end(d);
+            }
+            None => {
+                let (Some(mut d_keys), Some(mut d_values)) = (begin(self.keys), begin(self.values)) else {
+                    return;
+                };
+                let adds = [adds(&d_keys), adds(&d_values)];
+                let keys = KeysMut::Apart(d_keys.view_mut(), d_values.view_mut());
+                attention::backward(sides, groups, weights, d_out.view(), SidesMut { queries, keys, adds });
+                back.gradients.end(d_keys);
+                back.gradients.end(d_values);
+            }
+        }
+        back.gradients.contribute(self.queries, d_queries);
+    }
+}
+
 #[cfg(test)]
 mod tests {
+    use super::Over;
     use crate::{
-        Attention, LayoutBuilder,
+        Attention, LayoutBuilder, Linear, Tape, Var,
         attention::{Group, Visible},
-        gradcheck::check_operation,
+        gradcheck::{check_operation, noise, run_operation},
     };
 
     /// Two passes over the same entities through different masks, as REFIL makes them; the second group's query sees
@@ -117,5 +178,41 @@ mod tests {
             tape.attend_into(&attention, queries, key_values, &groups, &all, out);
             out
         });
+    }
+
+    /// Keys that all heads share, and rows that several keys stand for: two groups' keys 0, 2 and 3 are one entity.
+    #[test]
+    fn shared_keys_and_shared_rows() {
+        let mut layout = LayoutBuilder::default();
+        let (queries, values) =
+            (Linear::new(&mut layout, "queries", 3, 6), Linear::new(&mut layout, "values", 3, 4));
+        let groups = [Group { queries: 0..2, keys: 0..3 }, Group { queries: 2..3, keys: 3..5 }];
+        let rows = [1, 0, 1, 1, 2];
+        let mask = [1, 0, 1, 1, 1, 1, 1, 1];
+        let attend = |tape: &mut Tape<'_>, x: &[Var], rows: Option<&'static [usize]>| {
+            let queries = tape.linear(&queries, x[0]);
+            let values = tape.linear_relu(&values, x[1]);
+            let over = Over { queries, keys: x[1], values, rows, heads: 2, head_dim: 2 };
+            let out = tape.reserve(3, 4);
+            tape.attend_over(
+                over,
+                Box::leak(Box::new(groups.clone())),
+                &[Visible::Where(&*Box::leak(Box::new(mask)))],
+                out,
+            );
+            out
+        };
+        let shared: &'static [usize] = Box::leak(Box::new(rows));
+        check_operation(layout.len(), &[(3, 3), (3, 3)], |tape, x| attend(tape, x, Some(shared)));
+        check_operation(layout.len(), &[(3, 3), (5, 3)], |tape, x| attend(tape, x, None));
+        // The same as rows that are written out.
+        let (params, of_queries, of_keys) = (noise(1, layout.len()), noise(2, 9), noise(3, 9));
+        let written: Vec<f32> = rows.iter().flat_map(|&row| of_keys[row * 3..][..3].to_vec()).collect();
+        let one = run_operation(&params, &[(&of_queries, 3), (&of_keys, 3)], |tape, x| {
+            attend(tape, x, Some(shared))
+        });
+        let other =
+            run_operation(&params, &[(&of_queries, 3), (&written, 3)], |tape, x| attend(tape, x, None));
+        assert_eq!(one, other);
     }
 }
