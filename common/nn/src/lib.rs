@@ -11,6 +11,7 @@
 pub mod activation;
 pub mod attention;
 pub mod categorical;
+pub mod derived;
 pub mod gaussian;
 pub mod generated;
 pub mod gradcheck;
@@ -29,6 +30,7 @@ pub mod tape;
 mod view;
 
 pub use attention::Attention;
+pub use derived::Derived;
 pub use generated::Generated;
 pub use gru::Gru;
 pub use hidden_token::HiddenToken;

@@ -58,6 +58,12 @@ impl Linear {
         Self { weight, bias, inputs: self.inputs, outputs: outputs.len() }
     }
 
+    /// The same layer in a buffer that begins this much later.
+    pub(crate) fn moved_back(&self, by: usize) -> Self {
+        let back = |range: &Range<usize>| range.start - by..range.end - by;
+        Self { weight: back(&self.weight), bias: back(&self.bias), ..*self }
+    }
+
     /// The weight, (outputs, inputs).
     pub fn weight<'a>(&self, params: &'a [f32]) -> View<'a> {
         View::dense(&params[self.weight.clone()], self.inputs)
