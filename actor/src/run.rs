@@ -18,6 +18,7 @@ use rit_proto::{
 };
 use std::{
     fmt, fs, io,
+    path::Path,
     sync::{
         Arc,
         atomic::{AtomicBool, Ordering},
@@ -178,8 +179,9 @@ impl Learner {
             Self::Here(run_dir) => {
                 let no_address =
                     |error| ActorError::NoAddress { run_dir: run_dir.root().display().to_string(), error };
-                let address = fs::read_to_string(run_dir.address()).map_err(no_address)?.trim().parse()?;
-                Ok((address, Credentials::token(run_dir.token())))
+                fs::metadata(run_dir.address()).map_err(no_address)?;
+                // Not what the file says: in a copied directory it leads to the other's learner.
+                Ok((Address::Unix(run_dir.socket()), Credentials::token(run_dir.token())))
             }
         }
     }
@@ -257,7 +259,9 @@ impl Actor {
             rollout: Roller::rollout(&config),
             sink: match &self.learner {
                 Learner::Here(run_dir) => {
-                    let space = RunSpace::new(&run_dir.shared_memory_root())?;
+                    let path = run_dir.shared_memory();
+                    let place = fs::read_to_string(&path).map_err(|error| gone(&error))?;
+                    let space = RunSpace::new(Path::new(place.trim_end()))?;
                     let sender = EpisodeSender::open(&space, layout.len(), OPEN_TIMEOUT)?;
                     EpisodeSink::SharedMemory(Box::new(sender))
                 }

@@ -3,7 +3,7 @@
 use crate::{failure::Failure, finished::Finished};
 use rit_config::RunDir;
 use rit_proto::{
-    transport::{self, Client, ConnectError, Credentials},
+    transport::{self, Address, Client, ConnectError, Credentials},
     v1::control_client::ControlClient,
 };
 use std::fs;
@@ -50,13 +50,14 @@ enum Silence {
 }
 
 async fn dial(run_dir: &RunDir) -> Result<ControlClient<Client>, Silence> {
-    let address = fs::read_to_string(run_dir.address()).map_err(|_| {
+    fs::metadata(run_dir.address()).map_err(|_| {
         let root = run_dir.root().display();
         Silence::Absent(Failure::runtime_message(format!(
             "no learner runs for {root}; `rit train --resume {root}` goes on with the run"
         )))
     })?;
-    let address = address.trim().parse().map_err(|error| Silence::Other(Failure::runtime(error)))?;
+    // Not what the file says: in a copied directory it leads to the other's learner.
+    let address = Address::Unix(run_dir.socket());
     match transport::connect(&address, &Credentials::token(run_dir.token())).await {
         Ok(client) => Ok(ControlClient::new(client)),
         Err(error @ ConnectError::NoAnswer { .. }) => Err(Silence::Absent(error.into())),

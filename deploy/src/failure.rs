@@ -148,7 +148,7 @@ impl From<LearnerError> for Failure {
         match error {
             LearnerError::Listen(_)
             | LearnerError::Web(_)
-            | LearnerError::RunSpace(_)
+            | LearnerError::Life(_)
             | LearnerError::SharedMemory(_) => Self::Unavailable(error.into()),
             LearnerError::Access(_)
             | LearnerError::Address(_)

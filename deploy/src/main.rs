@@ -3,6 +3,7 @@
 
 mod bench;
 mod certificates;
+mod child;
 mod cli;
 mod control;
 mod ctl;
@@ -34,6 +35,7 @@ use failure::Failure;
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
+    child::take_name();
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
         Err(error) => return usage::report(&error),

@@ -8,33 +8,44 @@ use crate::{
     shutdown,
 };
 use rit_actor::Learner;
-use rit_config::RunDir;
+use rit_config::{OwnedRunDir, RunDir};
 use std::process::ExitCode;
 use tracing::Instrument as _;
 
 /// `rit learner`.
 pub async fn learner(options: LearnerOptions, logs: LogOptions) -> Result<ExitCode, Failure> {
     let (span, set_log) = logs.start("learner")?;
-    if let Some(experiment) = &options.new {
-        let mut settings = options.settings.clone();
-        settings.extend(experiments::algorithm(options.algorithm.as_deref()));
-        let experiment = experiments::load(experiment, &settings)?;
-        RunDir::create(&options.run_dir, &experiment.config)?;
-    }
-    let (run_dir, config) = RunDir::open(&options.run_dir)?;
+    let (owned, config) = match &options.new {
+        Some(experiment) => {
+            let mut settings = options.settings.clone();
+            settings.extend(experiments::algorithm(options.algorithm.as_deref()));
+            let config = experiments::load(experiment, &settings)?.config;
+            (OwnedRunDir::create(&options.run_dir, &config)?, config)
+        }
+        None => OwnedRunDir::open(&options.run_dir, options.supervised)?,
+    };
+    owned.notices().iter().for_each(|notice| tracing::warn!("{notice}"));
     let shutdown = shutdown::requested(options.supervised);
+    let run_dir = owned.run_dir().clone();
     let ended = rit_learner::run(run_dir, config, set_log, shutdown).instrument(span).await;
-    let summary = ended.map_err(|error| match Failure::from(error) {
+    let failed = match ended.map_err(Failure::from) {
+        Ok(summary) => {
+            tracing::info!(
+                digest = summary.weights_digest,
+                env_steps = summary.progress.env_steps,
+                "the run is over"
+            );
+            return Ok(ExitCode::SUCCESS);
+        }
         // For people, what they gave it does not fit what is there.
-        Failure::Unavailable(error) if !options.supervised => Failure::Input(error),
-        failure => failure,
-    })?;
-    tracing::info!(
-        digest = summary.weights_digest,
-        env_steps = summary.progress.env_steps,
-        "the run is over"
-    );
-    Ok(ExitCode::SUCCESS)
+        Err(Failure::Unavailable(error)) if !options.supervised => Failure::Input(error),
+        Err(failure) => failure,
+    };
+    if matches!(failed, Failure::Input(_)) && !options.supervised {
+        // The same command will do for the next attempt.
+        owned.undo()?;
+    }
+    Err(failed)
 }
 
 /// `rit actor`.

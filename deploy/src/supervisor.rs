@@ -136,6 +136,11 @@ impl Supervisor {
         }
     }
 
+    /// Whether a learner has ever answered.
+    pub fn has_begun(&self) -> bool {
+        self.begun
+    }
+
     /// When [`Event::Tick`] is due next, if ever.
     pub fn deadline(&self) -> Option<Duration> {
         let start = match (&self.phase, &self.contact) {

@@ -10,35 +10,46 @@ use crate::{
     progress::Progress,
     supervisor::{Outcome, watch_over},
 };
-use rit_config::{Config, RunDir};
-use rit_ipc::RunSpace;
-use std::{fs, num::NonZero, path::Path, process::ExitCode};
+use rit_config::{Config, OwnedRunDir, RunDir};
+use rit_learner::life;
+use std::{num::NonZero, path::Path, process::ExitCode};
 use tracing::Instrument as _;
 
 /// `rit train`.
 pub async fn run(options: TrainOptions, logs: LogOptions) -> Result<ExitCode, Failure> {
-    let (run_dir, config, name) = prepare(&options.config)?;
-    let span = logs.start_in(&run_dir.logs().join("train.log"), "train")?;
-    supervise(&run_dir, &config, &name, &logs, options.json).instrument(span).await
+    let (owned, config, name) = prepare(&options.config)?;
+    let started = refuse_no_actors(&config)
+        .and_then(|()| logs.start_in(&owned.run_dir().logs().join("train.log"), "train"));
+    let span = match started {
+        Ok(span) => span,
+        Err(failure) => {
+            owned.undo()?;
+            return Err(failure);
+        }
+    };
+    supervise(owned, &config, &name, &logs, options.json).instrument(span).await
 }
 
 async fn supervise(
-    run_dir: &RunDir,
+    owned: OwnedRunDir,
     config: &Config,
     name: &str,
     logs: &LogOptions,
     json: bool,
 ) -> Result<ExitCode, Failure> {
+    let run_dir = owned.run_dir();
     let mut progress = Progress::new(config.training.t_max, json);
     let root = run_dir.root().display();
     progress.say(&format!("{name}: learner and {} actors, run directory {root}", config.actors.count));
+    owned.notices().iter().for_each(|notice| progress.say(notice));
     if let Some(words) = too_many_actors(config.actors.count) {
         progress.say(&words);
     }
 
-    let outcome = watch_over(run_dir, logs, &mut progress, config.actors.count as u32).await;
+    let (outcome, begun) = watch_over(&owned, logs, &mut progress, config.actors.count as u32).await;
     progress.finish();
-    remove_shared_memory(run_dir);
+    // Whatever became of the children, nothing of the run stays in shared memory.
+    life::remove_dead(run_dir);
     match outcome {
         Outcome::Finished => print_summary(run_dir, json).map(|()| ExitCode::SUCCESS),
         Outcome::Interrupted => {
@@ -46,9 +57,9 @@ async fn supervise(
             Ok(ExitCode::from(INTERRUPTED))
         }
         Outcome::Failed { input: true, message } => {
-            if !run_dir.metrics().exists() {
-                // It never began: the same directory will do for the next attempt.
-                fs::remove_dir_all(run_dir.root()).map_err(Failure::runtime)?;
+            if !begun {
+                // The same command will do for the next attempt.
+                owned.undo()?;
             }
             Err(Failure::input_message(message))
         }
@@ -57,11 +68,11 @@ async fn supervise(
 }
 
 /// A new run's directory, or that of a run to go on with; its configuration and what it is called.
-fn prepare(options: &ConfigOptions) -> Result<(RunDir, Config, String), Failure> {
+fn prepare(options: &ConfigOptions) -> Result<(OwnedRunDir, Config, String), Failure> {
     let settings = experiments::settings(options);
     let (run_dir, config, name) = match (&options.resume, &options.experiment) {
         (Some(root), _) => {
-            let (run_dir, config) = RunDir::resume(root, &experiments::parse_settings(&settings)?)?;
+            let (run_dir, config) = OwnedRunDir::resume(root, &experiments::parse_settings(&settings)?)?;
             let name = format!("going on with {}", config.environment.task_set);
             (run_dir, config, name)
         }
@@ -71,14 +82,13 @@ fn prepare(options: &ConfigOptions) -> Result<(RunDir, Config, String), Failure>
                 options.algorithm.as_ref().map_or(name.clone(), |algorithm| format!("{name}-{algorithm}"));
             refuse_no_actors(&config)?;
             let run_dir = match &options.run_dir {
-                Some(root) => RunDir::create(root, &config)?,
-                None => RunDir::create_fresh(Path::new("runs"), &name, &config)?,
+                Some(root) => OwnedRunDir::create(root, &config)?,
+                None => OwnedRunDir::create_fresh(Path::new("runs"), &name, &config)?,
             };
             (run_dir, config, name)
         }
         (None, None) => return Err(Failure::input_message("which experiment? `rit experiments` lists them")),
     };
-    refuse_no_actors(&config)?;
     Ok((run_dir, config, name))
 }
 
@@ -101,15 +111,6 @@ fn refuse_no_actors(config: &Config) -> Result<(), Failure> {
     Err(Failure::input_message(
         "actors.count = 0: `rit train` needs at least one actor; set actors.remote for actors on other hosts",
     ))
-}
-
-/// Whatever became of the children, nothing of the run stays in shared memory.
-pub fn remove_shared_memory(run_dir: &RunDir) {
-    match RunSpace::new(&run_dir.shared_memory_root()).map(|space| space.remove()) {
-        Ok(Ok(())) => {}
-        Ok(Err(error)) => tracing::warn!(%error, "something of the run is still in shared memory"),
-        Err(error) => tracing::warn!(%error, "something of the run is still in shared memory"),
-    }
 }
 
 /// Prints what the run came to. Where that cannot be written the run has come to its end all the same, and the exit

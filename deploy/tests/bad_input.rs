@@ -131,7 +131,7 @@ fn a_second_learner_and_a_second_actor_of_one_name_are_refused() {
         &["actor", "--run-dir", run, "--name", "actor-0"],
         &["an actor named actor-0 is there already", "--name"],
     );
-    refused(&["learner", "--run-dir", run], &["learner.sock is in use"]);
+    refused(&["learner", "--run-dir", run], &["is in use by process", "rit ctl"]);
     train.wait_for("training after all", |status| status["updates"].as_u64() > Some(0));
 }
 

@@ -14,7 +14,7 @@ use rit_episode::{
     wire::{self, Frame, PayloadLayout},
 };
 use rit_ipc::{EpisodeSender, RunSpace};
-use std::time::Duration;
+use std::{fs, path::Path, time::Duration};
 
 #[test]
 fn forged_frames_are_counted_and_never_reach_replay() {
@@ -25,7 +25,8 @@ fn forged_frames_are_counted_and_never_reach_replay() {
     let mut train = folder.start(RUN);
     train.wait_for("training", |status| status["updates"].as_u64() > Some(0));
     let (run_dir, _) = RunDir::open(&folder.run_dir()).unwrap();
-    let space = RunSpace::new(&run_dir.shared_memory_root()).unwrap();
+    let place = fs::read_to_string(run_dir.shared_memory()).unwrap();
+    let space = RunSpace::new(Path::new(place.trim_end())).unwrap();
     let layout = PayloadLayout::new(TaskSet::MatrixGame.dims());
     let mut sender = EpisodeSender::open(&space, layout.len(), Duration::from_secs(5)).unwrap();
     let mut send = |frame: &Frame| sender.send(frame, &|| false).unwrap();

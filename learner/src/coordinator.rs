@@ -60,6 +60,9 @@ pub enum Event {
     Leaving(ActorId),
     /// An actor's stream has ended.
     Gone(ActorId),
+    /// Shared memory is elsewhere from now on, with what somebody should know of the new place: whoever sends there has
+    /// to join again.
+    PlaceLost(Option<String>),
     /// The trainer speaks.
     News(News),
     /// The writer is done with a checkpoint.
@@ -276,6 +279,7 @@ impl Coordinator {
                 self.part_if_done(actor);
             }
             Event::Gone(actor) => self.gone(actor),
+            Event::PlaceLost(notice) => self.place_lost(notice),
             Event::News(News::Trained(terms, standing)) => {
                 self.ledger.open(terms);
                 self.epsilon = terms.epsilon;
@@ -416,6 +420,18 @@ impl Coordinator {
         tracing::info!(name = actor.name, actor = id, had, "an actor has gone");
         self.happened(format!("{} has gone; it had {had} episodes", actor.name));
         self.hand_out();
+    }
+
+    /// Ends the sessions of this host's actors, which join again where shared memory is now.
+    fn place_lost(&mut self, notice: Option<String>) {
+        self.warned(
+            "the folder of the run's shared memory was removed while it ran; it is made anew, and actors join again"
+                .into(),
+        );
+        notice.into_iter().for_each(|notice| self.warned(notice));
+        let here: Vec<ActorId> =
+            self.actors.iter().filter(|(_, actor)| !actor.remote).map(|(&id, _)| id).collect();
+        here.into_iter().for_each(|id| self.gone(id));
     }
 
     fn insert(&mut self, id: ActorId, episode: Episode) {

@@ -13,6 +13,7 @@ pub mod episodes_service;
 pub mod evaluation;
 pub mod gauges;
 pub mod ledger;
+pub mod life;
 pub mod measured;
 pub mod metrics;
 pub mod prometheus;

@@ -1,7 +1,7 @@
 //! Reads frames, checks them, and passes episodes on: [`receive`] is the thread that does so with those in shared
 //! memory, where they lie.
 
-use crate::{coordinator::Event, ledger::ActorId};
+use crate::{LearnerError, coordinator::Event, ledger::ActorId};
 use rit_episode::wire::{self, Expected, Header, Rejection};
 use rit_ipc::{EpisodeReceiver, ReceiveError};
 use std::{
@@ -40,17 +40,52 @@ pub fn read(header: Result<Header, Rejection>, payload: &[u8], expected: &Expect
     }
 }
 
-/// Receives until `stop` is set or nobody listens any more.
+/// Receives until `stop` is set or nobody listens any more. A place that somebody has taken away is replaced by that of
+/// the receiver that `renew` makes; [`Event::PlaceLost`] lets actors join again, there.
 ///
 /// # Errors
 /// When shared memory fails.
 pub fn receive(
     mut receiver: EpisodeReceiver,
+    renew: impl Fn() -> Result<(EpisodeReceiver, Option<String>), LearnerError>,
     expected: &Expected,
     events: &async_mpsc::Sender<Event>,
     fences: &mpsc::Receiver<Fence>,
     stop: &AtomicBool,
-) -> Result<(), ReceiveError> {
+) -> Result<(), LearnerError> {
+    loop {
+        match receive_while_whole(&mut receiver, expected, events, fences, stop) {
+            Ok(End::Over) => return Ok(()),
+            Ok(End::PlaceLost) => {}
+            // Without its place anything may fail.
+            Err(_) if !receiver.is_whole() => {}
+            Err(error) => return Err(error.into()),
+        }
+        drop(receiver);
+        let notice;
+        (receiver, notice) = renew()?;
+        tracing::warn!("the folder of the run's shared memory was removed and is made anew");
+        if events.blocking_send(Event::PlaceLost(notice)).is_err() {
+            return Ok(());
+        }
+    }
+}
+
+/// Why receiving ends.
+enum End {
+    /// Nobody wants more.
+    Over,
+    /// The place is not there any more.
+    PlaceLost,
+}
+
+fn receive_while_whole(
+    receiver: &mut EpisodeReceiver,
+    expected: &Expected,
+    events: &async_mpsc::Sender<Event>,
+    fences: &mpsc::Receiver<Fence>,
+    stop: &AtomicBool,
+) -> Result<End, ReceiveError> {
     let mut reaped = Instant::now();
     while !stop.load(Ordering::Relaxed) {
         // Fences are taken up before frames are read and answered after.
@@ -59,19 +94,22 @@ pub fn receive(
             let event = read(Ok(*frame.header()), frame.payload(), expected);
             drop(frame);
             if events.blocking_send(event).is_err() {
-                return Ok(());
+                return Ok(End::Over);
             }
         }
         for fence in fences {
             if events.blocking_send(Event::Fenced(fence)).is_err() {
-                return Ok(());
+                return Ok(End::Over);
             }
         }
         if reaped.elapsed() >= REAP_EVERY {
+            if !receiver.is_whole() {
+                return Ok(End::PlaceLost);
+            }
             receiver.reap_dead()?;
             reaped = Instant::now();
         }
         receiver.wait(WAIT)?;
     }
-    Ok(())
+    Ok(End::Over)
 }

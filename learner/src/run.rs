@@ -5,6 +5,7 @@ use crate::{
     control_service::ControlService,
     coordinator::{Coordinator, Event},
     episodes_service::EpisodesService,
+    life::{self, EndOfLife, LifeError},
     receive::receive,
     replay_log::{ReplayLog, ReplayLogError},
     rollout_service::RolloutService,
@@ -21,7 +22,7 @@ use rit_episode::{
     Stream,
     wire::{Expected, PayloadLayout},
 };
-use rit_ipc::{CreateError, EpisodeReceiver, Limits, ReceiveError, RunSpace, RunSpaceError};
+use rit_ipc::{CreateError, EpisodeReceiver, Limits, ReceiveError};
 use rit_proto::{
     MESSAGE_BYTES_MAX,
     transport::{
@@ -74,9 +75,9 @@ pub enum LearnerError {
     /// The web page cannot be served.
     #[error(transparent)]
     Web(#[from] WebError),
-    /// The run directory is no place for shared memory.
+    /// There is no place for shared memory.
     #[error(transparent)]
-    RunSpace(#[from] RunSpaceError),
+    Life(#[from] LifeError),
     /// Shared memory cannot be had.
     #[error(transparent)]
     SharedMemory(#[from] CreateError),
@@ -127,9 +128,9 @@ pub async fn run(
         LearnerError::Io { what: "the update's threads".into(), error: io::Error::other(error) }
     })?;
     let expected = expected(&run_dir, &config);
-    let space = RunSpace::new(&run_dir.shared_memory_root())?;
+    let _end_of_life = EndOfLife(&run_dir);
     let limits = Limits::new(expected.layout.len(), config.actors.count.max(config.actors.count_max));
-    let receiver = EpisodeReceiver::create(&space, limits)?;
+    let (receiver, notice) = new_receiver(&run_dir, limits)?;
 
     let (events, event_queue) = async_mpsc::channel(EVENT_QUEUE);
     let (work, work_queue) = mpsc::channel();
@@ -139,12 +140,13 @@ pub async fn run(
         let _ = news.blocking_send(Event::News(what));
     });
     let measures = learner.measures();
-    let loaded = load(&run_dir, &*learner, &expected, &config)?;
+    let logged = Expected { run_id: run_dir.lineage(), ..expected.clone() };
+    let loaded = load(&run_dir, &*learner, &logged, &config)?;
     let episodes = loaded.as_ref().map_or(0, |loaded| loaded.state.manifest.progress.episodes);
     let writer = Writer {
         run_dir: run_dir.clone(),
         model: Arc::clone(&model),
-        log: ReplayLog::open(&run_dir.replay(), expected.layout, run_dir.run_id(), episodes)?,
+        log: ReplayLog::open(&run_dir.replay(), expected.layout, run_dir.lineage(), episodes)?,
         replay_episodes: config.replay_episodes(),
         keep: config.checkpoints.keep,
         events: events.clone(),
@@ -153,15 +155,18 @@ pub async fn run(
     let (trainer, board) = Trainer::new(config.clone(), run_dir.clone(), learner, loaded, news, to_write)?;
     let metrics = trainer.metrics_follower();
     let welcome = Welcome { actor: 0, run_id: run_dir.run_id().to_vec(), config: config.to_toml()? };
-    let coordinator = Coordinator::new(config.clone(), welcome, trainer.beginning(), work, fences);
+    let mut beginning = trainer.beginning();
+    beginning.warnings.extend(notice);
+    let coordinator = Coordinator::new(config.clone(), welcome, beginning, work, fences);
 
     let stop = Arc::new(AtomicBool::new(false));
     let expected = Arc::new(expected);
     let episodes = EpisodesService { events: events.clone(), expected: Arc::clone(&expected) };
     let receiving = {
-        let (events, stop) = (events.clone(), Arc::clone(&stop));
+        let (events, stop, run_dir) = (events.clone(), Arc::clone(&stop), run_dir.clone());
         spawn("receive", move || {
-            let result = receive(receiver, &expected, &events, &fence_queue, &stop);
+            let renew = || new_receiver(&run_dir, limits);
+            let result = receive(receiver, renew, &expected, &events, &fence_queue, &stop);
             let _ = events.blocking_send(Event::Over);
             result
         })?
@@ -240,12 +245,16 @@ pub async fn run(
     let _ = fs::remove_file(run_dir.address());
     let _ = fs::remove_file(run_dir.remote_address());
     receiving.await.map_err(|_| LearnerError::Panicked("receive"))??;
-    if let Err(error) = space.remove() {
-        tracing::warn!(%error, "something of the run is still in shared memory");
-    }
     let result = training.await.map_err(|_| LearnerError::Panicked("train"))?;
     writing.await.map_err(|_| LearnerError::Panicked("write"))?;
     Ok(result?)
+}
+
+/// A receiver in a place of its own; the second value says where that is not where it should be.
+fn new_receiver(run_dir: &RunDir, limits: Limits) -> Result<(EpisodeReceiver, Option<String>), LearnerError> {
+    let (space, notice) = life::begin(run_dir)?;
+    notice.iter().for_each(|notice| tracing::warn!("{notice}"));
+    Ok((EpisodeReceiver::create(&space, limits)?, notice))
 }
 
 /// What every episode of this run must look like.

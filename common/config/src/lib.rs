@@ -10,9 +10,12 @@ mod error;
 mod keys;
 mod method_keys;
 mod number;
+mod owned_run_dir;
 mod regular_file;
 mod resolve;
 mod run_dir;
+mod run_lock;
+mod run_place;
 
 pub use config::{
     Actors, Algorithm, Checkpoints, Config, Environment, Evaluation, Learner, Network, OptimizerName,
@@ -20,6 +23,8 @@ pub use config::{
 };
 pub use error::ConfigError;
 pub use number::{CountError, WHOLE_MAX, count};
+pub use owned_run_dir::OwnedRunDir;
 pub use regular_file::{TEXT_BYTES_MAX, read_regular, read_text};
 pub use resolve::{is_live, key_like, resolve, set, set_live};
 pub use run_dir::{RunDir, RunDirError};
+pub use run_lock::RunLock;

@@ -1,23 +1,27 @@
 //! The run directory: where everything of one run lies, and under which names.
 
-use crate::{Config, ConfigError, method_keys, resolve, resolve::may_go_on};
+use crate::{Config, ConfigError, read_text, resolve};
 use rit_episode::wire::RunId;
 use std::{
-    fs::{self, DirBuilder, OpenOptions, Permissions},
+    env, fs,
     io::{self, ErrorKind, Write as _},
-    os::unix::fs::{DirBuilderExt as _, OpenOptionsExt as _, PermissionsExt as _},
+    os::unix::fs::OpenOptionsExt as _,
     path::{Path, PathBuf},
 };
 
-const RUN_ID: &str = "run_id";
-const TOKEN: &str = "token";
+pub(crate) const CONFIG: &str = "config.toml";
+pub(crate) const RUN_ID: &str = "run_id";
+pub(crate) const TOKEN: &str = "token";
+/// In a copy: the identity of the run that it was copied from.
+pub(crate) const LINEAGE: &str = "lineage";
 
 /// One run's directory. Only its user may look inside.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RunDir {
-    root: PathBuf,
-    run_id: RunId,
-    token: String,
+    pub(crate) root: PathBuf,
+    pub(crate) run_id: RunId,
+    pub(crate) lineage: RunId,
+    pub(crate) token: String,
 }
 
 /// Why a run directory cannot be made or read.
@@ -26,9 +30,50 @@ pub enum RunDirError {
     /// It would be written over.
     #[error("{0} already holds a run; choose another --run-dir, or move it away")]
     Occupied(PathBuf),
+    /// Somebody else's things would lie among the run's.
+    #[error("{root} is not empty, {entry} lies there; choose another --run-dir, or an empty one")]
+    NotEmpty {
+        /// The directory.
+        root: PathBuf,
+        /// What lies in it.
+        entry: String,
+    },
+    /// Another process writes to it.
+    #[error(
+        "{root} is in use by {}; stop that run first (`rit ctl --run {root} stop`), or wait for its end",
+        .holder.map_or_else(|| "another process".to_owned(), |pid| format!("process {pid}"))
+    )]
+    InUse {
+        /// The directory.
+        root: PathBuf,
+        /// The process, if it says so.
+        holder: Option<u32>,
+    },
     /// There is none.
-    #[error("{0} holds no run: it has no config.toml")]
-    Missing(PathBuf),
+    #[error("{root} holds no run: {why}")]
+    Missing {
+        /// The directory.
+        root: PathBuf,
+        /// What is not there.
+        why: &'static str,
+    },
+    /// A link that leads nowhere.
+    #[error("{link} is a link to {target}, which does not exist; make that folder, or remove the link")]
+    DanglingLink {
+        /// The link.
+        link: PathBuf,
+        /// Where it leads.
+        target: PathBuf,
+    },
+    /// A file, where a directory belongs.
+    #[error("{0} is a file and no directory; choose another, or move it away")]
+    NotADirectory(PathBuf),
+    /// A relative path, and nothing that it is relative to.
+    #[error("the current folder, from which {0} is meant, has been deleted; change to one that exists")]
+    CurrentFolderDeleted(PathBuf),
+    /// Configurations, addresses and messages are text, and so are the paths in them.
+    #[error("{0:?}: a run directory's path has to be UTF-8; rename it, or choose another")]
+    NotUtf8(PathBuf),
     /// Its configuration cannot be used.
     #[error("{path}: {error}")]
     Config {
@@ -51,70 +96,20 @@ pub enum RunDirError {
 }
 
 impl RunDir {
-    /// Makes a directory for a new run and writes the resolved configuration into it.
-    ///
-    /// # Errors
-    /// When the directory holds anything already, or cannot be written.
-    pub fn create(root: &Path, config: &Config) -> Result<Self, RunDirError> {
-        let io = |path: &Path| {
-            let path = path.to_owned();
-            move |error| RunDirError::Io { path, error }
-        };
-        match fs::read_dir(root).map(|mut entries| entries.next().is_some()) {
-            Ok(true) => return Err(RunDirError::Occupied(root.to_owned())),
-            Ok(false) => {
-                fs::set_permissions(root, Permissions::from_mode(0o700)).map_err(io(root))?;
-            }
-            Err(error) if error.kind() == ErrorKind::NotFound => {
-                DirBuilder::new().recursive(true).mode(0o700).create(root).map_err(io(root))?;
-            }
-            Err(error) => return Err(io(root)(error)),
-        }
-        let root = root.canonicalize().map_err(io(root))?;
-        let (run_id, token) = (random_bytes().map_err(io(&root))?, hex(random_bytes().map_err(io(&root))?));
-        let run_dir = Self { root, run_id, token };
-        let write = |path: PathBuf, text: String| {
-            let file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&path);
-            file.and_then(|mut file| file.write_all(text.as_bytes())).map_err(io(&path))
-        };
-        write(run_dir.root.join(RUN_ID), hex(run_id) + "\n")?;
-        write(run_dir.root.join(TOKEN), run_dir.token.clone() + "\n")?;
-        write(run_dir.config_path(), run_dir.to_toml(config)?)?;
-        for folder in [run_dir.logs(), run_dir.checkpoints()] {
-            DirBuilder::new().mode(0o700).create(&folder).map_err(io(&folder))?;
-        }
-        Ok(run_dir)
-    }
-
-    fn to_toml(&self, config: &Config) -> Result<String, RunDirError> {
+    pub(crate) fn to_toml(&self, config: &Config) -> Result<String, RunDirError> {
         config.to_toml().map_err(|error| RunDirError::Config { path: self.config_path(), error })
     }
 
-    /// Makes the next free directory `{parent}/{name}-{n}`.
-    ///
-    /// # Errors
-    /// When it cannot be written.
-    pub fn create_fresh(parent: &Path, name: &str, config: &Config) -> Result<Self, RunDirError> {
-        let mut n = 1;
-        loop {
-            match Self::create(&parent.join(format!("{name}-{n}")), config) {
-                Err(RunDirError::Occupied(_)) => n += 1,
-                made_or_failed => return made_or_failed,
-            }
-        }
-    }
-
-    /// Opens a run's directory and reads its configuration.
+    /// Opens a run's directory to look at it, and reads its configuration. To write to it, see
+    /// [`OwnedRunDir`](crate::OwnedRunDir).
     ///
     /// # Errors
     /// When it holds no run, or an altered one.
     pub fn open(root: &Path) -> Result<(Self, Config), RunDirError> {
-        let missing = || RunDirError::Missing(root.to_owned());
-        let root = root.canonicalize().map_err(|_| missing())?;
-        let path = root.join("config.toml");
-        let text = fs::read_to_string(&path).map_err(|_| missing())?;
-        let config =
-            resolve(&text, "config.toml", &[]).map_err(|error| RunDirError::Config { path, error })?;
+        let root = existing(root)?;
+        let text = read_config(&root)?;
+        let config = resolve(&text, CONFIG, &[])
+            .map_err(|error| RunDirError::Config { path: root.join(CONFIG), error })?;
         let digits = |name: &str| {
             let path = root.join(name);
             let text =
@@ -122,26 +117,8 @@ impl RunDir {
             from_hex(text.trim()).ok_or(RunDirError::NotHex(path))
         };
         let (run_id, token) = (digits(RUN_ID)?, hex(digits(TOKEN)?));
-        Ok((Self { root, run_id, token }, config))
-    }
-
-    /// Opens a run's directory to go on with other settings, and writes the new configuration down.
-    ///
-    /// # Errors
-    /// When it holds no run, or a setting would change the result of what has been trained already.
-    pub fn resume(root: &Path, settings: &[toml::Table]) -> Result<(Self, Config), RunDirError> {
-        let (run_dir, old) = Self::open(root)?;
-        let path = run_dir.config_path();
-        let io = |error| RunDirError::Io { path: path.clone(), error };
-        let text = fs::read_to_string(&path).map_err(io)?;
-        let wrong = |error| RunDirError::Config { path: path.clone(), error };
-        method_keys::same(old.algorithm.name, settings).map_err(wrong)?;
-        let new = resolve(&text, "config.toml", settings).map_err(wrong)?;
-        may_go_on(&old, &new).map_err(wrong)?;
-        if new != old {
-            run_dir.write_config(&new)?;
-        }
-        Ok((run_dir, new))
+        let lineage = if root.join(LINEAGE).exists() { digits(LINEAGE)? } else { run_id };
+        Ok((Self { root, run_id, lineage, token }, config))
     }
 
     /// Writes another configuration down, as a whole or not at all.
@@ -150,10 +127,7 @@ impl RunDir {
     /// When it cannot be written.
     pub fn write_config(&self, config: &Config) -> Result<(), RunDirError> {
         let path = self.config_path();
-        let partial = path.with_extension("partial");
-        fs::write(&partial, self.to_toml(config)?)
-            .and_then(|()| fs::rename(&partial, &path))
-            .map_err(|error| RunDirError::Io { path, error })
+        write_whole(&path, &self.to_toml(config)?).map_err(|error| RunDirError::Io { path, error })
     }
 
     /// The directory itself, absolute.
@@ -161,9 +135,14 @@ impl RunDir {
         &self.root
     }
 
-    /// What the run's frames carry.
+    /// What the run's frames carry on their way to the learner.
     pub fn run_id(&self) -> RunId {
         self.run_id
+    }
+
+    /// What the run's files carry: in a copy of a run, the identity of the first one, whose files it goes on with.
+    pub fn lineage(&self) -> RunId {
+        self.lineage
     }
 
     /// The secret that whoever speaks to the run's learner must know.
@@ -193,7 +172,7 @@ impl RunDir {
 
     /// The resolved configuration.
     pub fn config_path(&self) -> PathBuf {
-        self.root.join("config.toml")
+        self.root.join(CONFIG)
     }
 
     /// The learner's socket.
@@ -231,21 +210,84 @@ impl RunDir {
         self.root.join("logs")
     }
 
-    /// Where the run's shared memory is administered: short, since socket paths lie below it, and the user's.
-    pub fn shared_memory_root(&self) -> PathBuf {
-        std::env::temp_dir().join(format!("rit-{}", &hex(self.run_id)[..8]))
+    /// Where the learner's shared memory is administered: a line of text, written anew by each learner.
+    pub fn shared_memory(&self) -> PathBuf {
+        self.root.join("shared_memory")
+    }
+
+    /// Writes down where the learner's shared memory is administered.
+    ///
+    /// # Errors
+    /// When it cannot be written.
+    pub fn write_shared_memory(&self, directory: &Path) -> io::Result<()> {
+        write_whole(&self.shared_memory(), &format!("{}\n", directory.display()))
     }
 }
 
+/// An existing directory's canonical path.
+pub(crate) fn existing(root: &Path) -> Result<PathBuf, RunDirError> {
+    let found = match root.canonicalize() {
+        Ok(found) => found,
+        Err(error) => return Err(why_missing(root, error)),
+    };
+    if !found.is_dir() {
+        return Err(RunDirError::NotADirectory(root.to_owned()));
+    }
+    utf8(&found)?;
+    Ok(found)
+}
+
+/// What is wrong with a path that leads nowhere.
+pub(crate) fn why_missing(root: &Path, error: io::Error) -> RunDirError {
+    if root.is_relative() && env::current_dir().is_err() {
+        return RunDirError::CurrentFolderDeleted(root.to_owned());
+    }
+    // The run directory itself, or a folder on the way to it.
+    for link in root.ancestors().filter(|path| path.is_symlink() && !path.exists()) {
+        if let Ok(target) = fs::read_link(link) {
+            return RunDirError::DanglingLink { link: link.to_owned(), target };
+        }
+    }
+    match error.kind() {
+        ErrorKind::NotFound => RunDirError::Missing { root: root.to_owned(), why: "there is no such folder" },
+        ErrorKind::NotADirectory => {
+            let file = root.ancestors().find(|path| path.is_file()).unwrap_or(root);
+            RunDirError::NotADirectory(file.to_owned())
+        }
+        _ => RunDirError::Io { path: root.to_owned(), error },
+    }
+}
+
+pub(crate) fn utf8(path: &Path) -> Result<(), RunDirError> {
+    path.to_str().map(|_| ()).ok_or_else(|| RunDirError::NotUtf8(path.to_owned()))
+}
+
+/// The configuration's text.
+pub(crate) fn read_config(root: &Path) -> Result<String, RunDirError> {
+    let path = root.join(CONFIG);
+    read_text(&path).map_err(|error| match error.kind() {
+        ErrorKind::NotFound => RunDirError::Missing { root: root.to_owned(), why: "it has no config.toml" },
+        _ => RunDirError::Io { path, error },
+    })
+}
+
+/// Writes a file for the run's user alone, as a whole or not at all.
+pub(crate) fn write_whole(path: &Path, text: &str) -> io::Result<()> {
+    let partial = path.with_extension("partial");
+    let mut options = fs::OpenOptions::new();
+    let mut file = options.write(true).create(true).truncate(true).mode(0o600).open(&partial)?;
+    file.write_all(text.as_bytes()).and_then(|()| fs::rename(&partial, path))
+}
+
 /// Sixteen bytes that no other run has and nobody guesses.
-fn random_bytes() -> io::Result<RunId> {
+pub(crate) fn random_bytes() -> io::Result<RunId> {
     let mut bytes = RunId::default();
     // So few bytes come at once, or not at all.
     rustix::rand::getrandom(&mut bytes, rustix::rand::GetRandomFlags::empty())?;
     Ok(bytes)
 }
 
-fn hex(bytes: RunId) -> String {
+pub(crate) fn hex(bytes: RunId) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
@@ -263,62 +305,48 @@ fn from_hex(digits: &str) -> Option<RunId> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn config() -> Config {
-        resolve("environment.task_set = \"matrix-game\"\nseed = 5", "test", &[]).unwrap()
-    }
-
-    #[test]
-    fn what_is_created_can_be_opened_and_nothing_is_written_over() {
-        let folder = tempfile::tempdir().unwrap();
-        let root = folder.path().join("a/b");
-        let made = RunDir::create(&root, &config()).unwrap();
-        let (opened, read) = RunDir::open(&root).unwrap();
-        assert_eq!((&made, config()), (&opened, read));
-        assert_eq!(fs::metadata(&root).unwrap().permissions().mode() & 0o777, 0o700);
-        assert!(matches!(RunDir::create(&root, &config()), Err(RunDirError::Occupied(_))));
-        let other = RunDir::create(&folder.path().join("c"), &config()).unwrap();
-        assert_ne!((made.run_id(), made.token()), (other.run_id(), other.token()));
-    }
-
-    #[test]
-    fn a_run_goes_on_with_other_settings_unless_they_change_the_result() {
-        let folder = tempfile::tempdir().unwrap();
-        let root = folder.path().join("run");
-        RunDir::create(&root, &config()).unwrap();
-        let set = |text: &str| [crate::set(text).unwrap()];
-        let (_, longer) = RunDir::resume(&root, &set("training.t_max=70000")).unwrap();
-        assert_eq!(longer.training.t_max, 70_000);
-        let (_, more) = RunDir::resume(&root, &set("actors.count=5")).unwrap();
-        assert_eq!((more.training.t_max, more.actors.count), (70_000, 5), "what was set stays set");
-        for setting in ["algorithm.gamma=0.5", "seed=6", "learner.shards=3", "network.hidden_dim=8"] {
-            let error = RunDir::resume(&root, &set(setting)).unwrap_err().to_string();
-            let key = setting.split('=').next().unwrap();
-            assert!(error.contains(key) && error.contains("cannot change"), "{error}");
-        }
-        assert_eq!(RunDir::open(&root).unwrap().1, more);
-    }
-
-    #[test]
-    fn fresh_directories_count_up() {
-        let folder = tempfile::tempdir().unwrap();
-        let name = |run_dir: RunDir| run_dir.root().file_name().unwrap().to_owned();
-        for n in 1..4 {
-            let made = RunDir::create_fresh(folder.path(), "matrix-game", &config()).unwrap();
-            assert_eq!(name(made), *format!("matrix-game-{n}"));
-        }
-    }
+    use crate::OwnedRunDir;
+    use std::os::unix::{ffi::OsStrExt as _, fs::symlink};
 
     #[test]
     fn what_is_no_run_is_said_plainly() {
         let folder = tempfile::tempdir().unwrap();
         let error = |root: &Path| RunDir::open(root).unwrap_err().to_string();
         assert!(error(folder.path()).ends_with("holds no run: it has no config.toml"));
+        assert!(error(&folder.path().join("nowhere")).ends_with("holds no run: there is no such folder"));
+        let link = folder.path().join("link");
+        symlink("gone", &link).unwrap();
+        for path in [link.clone(), link.join("run")] {
+            assert!(
+                error(&path).contains("link is a link to gone, which does not exist"),
+                "{}",
+                error(&path)
+            );
+        }
+        let file = folder.path().join("file");
+        fs::write(&file, "").unwrap();
+        for path in [file.clone(), file.join("run")] {
+            assert!(error(&path).contains("file is a file and no directory"), "{}", error(&path));
+        }
+        let strange = folder.path().join(std::ffi::OsStr::from_bytes(b"\xff"));
+        fs::create_dir(&strange).unwrap();
+        assert!(error(&strange).contains("has to be UTF-8"), "{}", error(&strange));
+    }
+
+    #[test]
+    fn an_altered_run_is_said_plainly() {
+        let folder = tempfile::tempdir().unwrap();
+        let error = |root: &Path| RunDir::open(root).unwrap_err().to_string();
         let root = folder.path().join("run");
-        let made = RunDir::create(&root, &config()).unwrap();
-        fs::write(root.join("run_id"), "xyz").unwrap();
+        let config = resolve("environment.task_set = \"matrix-game\"", "test", &[]).unwrap();
+        let made = OwnedRunDir::create(&root, &config).unwrap().run_dir().clone();
+        fs::write(root.join(RUN_ID), "xyz").unwrap();
         assert!(error(&root).contains("was altered"));
         fs::write(made.config_path(), "environment.task_set = \"matrix-game\"\nalgorithm.gamma = 2").unwrap();
         assert!(error(&root).contains("algorithm.gamma = 2 is out of range"));
+        // Whatever hinders reading, it is no missing file.
+        fs::remove_file(made.config_path()).unwrap();
+        fs::create_dir(made.config_path()).unwrap();
+        assert!(error(&root).contains("config.toml: it is no regular file"), "{}", error(&root));
     }
 }

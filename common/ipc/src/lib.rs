@@ -1,8 +1,8 @@
 //! Episode frames over shared memory, from many actor processes to one learner process. The only user of
 //! iceoryx2, whose types stay inside, and the only crate with `unsafe` (in `bell`, to map one page).
 //!
-//! - [`RunSpace`] names one run's own place: nothing of another run is seen, and [`RunSpace::remove`] leaves
-//!   nothing behind.
+//! - [`RunSpace`] names a place of its own for one life of a run, a learner's: nothing of another is seen, and
+//!   [`RunSpace::remove`] leaves nothing behind.
 //! - [`EpisodeReceiver`] is the learner's end: it creates the place, waits without polling, and reads frames
 //!   where they lie.
 //! - [`EpisodeSender`] is an actor's end: one copy into shared memory, then it waits for as long as the learner
@@ -14,7 +14,7 @@
 //! # use std::{error::Error, time::Duration};
 //! # fn run(payload_len: usize, frame: Frame, stopping: fn() -> bool) -> Result<(), Box<dyn Error>> {
 //! // Every process of the run.
-//! let space = RunSpace::new("/tmp/rit-1000/1a2b3c4d".as_ref())?;
+//! let space = RunSpace::new("/tmp/rit-1a2b3c4d".as_ref())?;
 //!
 //! // The learner, in a thread of its own.
 //! let mut receiver = EpisodeReceiver::create(&space, Limits::new(payload_len, 4))?;
@@ -65,6 +65,6 @@ mod shared_memory;
 pub use limits::Limits;
 pub use node::{IceoryxError, Reaped};
 pub use receiver::{CreateError, EpisodeReceiver, ReceiveError, ReceivedFrame};
-pub use run_space::{DirectoryError, RemoveError, RunSpace, RunSpaceError};
+pub use run_space::{DirectoryError, FreshError, RemoveError, RunSpace, RunSpaceError};
 pub use sender::{EpisodeSender, OpenError, SendError};
 pub use shared_memory::{NoSpace, check_space};

@@ -169,6 +169,12 @@ impl EpisodeReceiver {
         Ok(node::remove(dead))
     }
 
+    /// Whether its place is still there. What cleans temporary folders may take it away: then nobody new finds it, and a
+    /// receiver in a fresh one is needed.
+    pub fn is_whole(&self) -> bool {
+        self.space.is_whole()
+    }
+
     /// Looks for frames, and connects to senders that are new.
     fn has_frames(&self) -> Result<bool, ReceiveError> {
         let found = self.subscriber.has_samples();

@@ -1,4 +1,5 @@
-//! One run's own place: a directory, a prefix for what lies in /dev/shm, and an end to both.
+//! A place of its own for one life of a run, from a learner's start to its end: a directory, a prefix for what lies in
+//! /dev/shm, and an end to both.
 
 use crate::shared_memory;
 use iceoryx2::config::Config;
@@ -19,7 +20,7 @@ const LENGTH_LIMIT: usize = 100;
 const NODES: &str = "nodes";
 const SERVICES: &str = "services";
 
-/// Names one run's own place for shared memory. Whoever names the same directory is in the same run.
+/// Names one life's own place for shared memory. Whoever names the same directory is in the same life.
 #[derive(Clone, Debug)]
 pub struct RunSpace {
     directory: PathBuf,
@@ -27,19 +28,19 @@ pub struct RunSpace {
     config: Config,
 }
 
-/// A directory that cannot name a run's place.
+/// A directory that cannot name a place for shared memory.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum RunSpaceError {
     /// Two processes may have different working directories.
-    #[error("the run directory {directory} is not absolute: give the whole path")]
+    #[error("the folder {directory} for shared memory is not absolute: give the whole path")]
     NotAbsolute {
         /// The directory.
         directory: PathBuf,
     },
     /// Names made from it would not fit.
     #[error(
-        "the run directory {directory} has {length} bytes where {limit} are allowed: choose a shorter one, like \
-         /tmp/rit-1000/1a2b3c4d"
+        "the folder {directory} for shared memory has {length} bytes where {limit} are allowed: choose a shorter one, \
+         such as /tmp/rit-1a2b3c4d"
     )]
     TooLong {
         /// The directory.
@@ -50,18 +51,18 @@ pub enum RunSpaceError {
         limit: usize,
     },
     /// iceoryx2 takes no such path.
-    #[error("the run directory {directory} has characters that a name in shared memory cannot have")]
+    #[error("the folder {directory} has characters that a name in shared memory cannot have")]
     Characters {
         /// The directory.
         directory: PathBuf,
     },
 }
 
-/// A run directory that cannot be used.
+/// A directory that cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum DirectoryError {
     /// Not made, or not read.
-    #[error("the run directory {directory} cannot be used: {source}")]
+    #[error("the folder {directory} for shared memory cannot be used: {source}")]
     Io {
         /// The directory.
         directory: PathBuf,
@@ -69,11 +70,25 @@ pub enum DirectoryError {
         source: io::Error,
     },
     /// Somebody else may write there.
-    #[error("the run directory {directory} is not private: it has to be yours, with mode 700")]
+    #[error("the folder {directory} for shared memory is not private: it has to be yours, with mode 700")]
     NotPrivate {
         /// The directory.
         directory: PathBuf,
     },
+}
+
+/// A place that could not be made.
+#[derive(Debug, thiserror::Error)]
+pub enum FreshError {
+    /// The folder's name gives no usable name.
+    #[error(transparent)]
+    Name(#[from] RunSpaceError),
+    /// The folder cannot be written to.
+    #[error(transparent)]
+    Directory(#[from] DirectoryError),
+    /// Its name could not be drawn or written down.
+    #[error("the name of a place for shared memory cannot be written down: {0}")]
+    Tell(io::Error),
 }
 
 /// Something of the run is still there.
@@ -123,12 +138,61 @@ impl RunSpace {
         Ok(Self { directory, prefix, config })
     }
 
+    /// Makes a place that nobody has used before and nobody guesses, in this folder. `tell` is given its name before it
+    /// is made, so that it can be found again, and removed, whatever happens next.
+    ///
+    /// # Errors
+    /// When the folder is no good for it, or `tell` fails.
+    pub fn make_fresh(
+        folder: &Path,
+        mut tell: impl FnMut(&Path) -> io::Result<()>,
+    ) -> Result<Self, FreshError> {
+        loop {
+            let mut name = [0; size_of::<u64>()];
+            // So few bytes come at once, or not at all.
+            rustix::rand::getrandom(&mut name, rustix::rand::GetRandomFlags::empty())
+                .map_err(|error| FreshError::Tell(error.into()))?;
+            let space = Self::new(&folder.join(format!("rit-{:016x}", u64::from_le_bytes(name))))?;
+            if !space.leftovers().map_err(|source| space.directory_error(source))?.is_empty() {
+                continue;
+            }
+            tell(space.directory()).map_err(FreshError::Tell)?;
+            match DirBuilder::new().mode(0o700).create(space.directory()) {
+                Ok(()) => return Ok(space),
+                Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
+                Err(error) => return Err(space.directory_error(error).into()),
+            }
+        }
+    }
+
     /// The directory.
     pub fn directory(&self) -> &Path {
         &self.directory
     }
 
-    /// Everything of this run that exists, in /dev/shm and in its directory: nothing before, and nothing after
+    /// Removes everything of a life whose learner has ended, and says whether it has: one that lives is left alone.
+    ///
+    /// # Errors
+    /// With the first thing that would not go, after all have been tried.
+    pub fn remove_if_dead(&self) -> Result<bool, RemoveError> {
+        let _lock = match self.lock() {
+            Ok(Some(lock)) => Some(lock),
+            Ok(None) => return Ok(false),
+            // Somebody has removed the directory, and a learner that has lost it has made another.
+            Err(DirectoryError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => None,
+            Err(error) => return Err(error.into()),
+        };
+        self.remove().map(|()| true)
+    }
+
+    /// Whether all that a learner has made here is still there.
+    pub(crate) fn is_whole(&self) -> bool {
+        let made = [NODES, SERVICES].map(|name| self.directory.join(name));
+        self.check_directory().is_ok()
+            && made.iter().chain([&self.segment(crate::bell::NAME)]).all(|path| path.exists())
+    }
+
+    /// Everything of this user's that exists here, in /dev/shm and in its directory: nothing before, and nothing after
     /// [`RunSpace::remove`].
     ///
     /// # Errors

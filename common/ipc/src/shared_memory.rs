@@ -51,13 +51,22 @@ fn free_of(stat: &StatVfs) -> u64 {
     stat.f_bavail.saturating_mul(stat.f_frsize)
 }
 
-/// Files in /dev/shm whose name begins with this prefix.
+/// This user's files in /dev/shm whose name begins with this prefix. Everybody may make files there: those of others
+/// are none of ours, whatever they are called.
 pub(crate) fn segments(prefix: &str) -> std::io::Result<Vec<PathBuf>> {
+    let user = rustix::process::geteuid().as_raw();
     let mut found = Vec::new();
     for entry in std::fs::read_dir(DIRECTORY)? {
         let entry = entry?;
-        if entry.file_name().as_encoded_bytes().starts_with(prefix.as_bytes()) {
-            found.push(entry.path());
+        if !entry.file_name().as_encoded_bytes().starts_with(prefix.as_bytes()) {
+            continue;
+        }
+        match entry.metadata() {
+            Ok(metadata) if metadata.uid() == user => found.push(entry.path()),
+            Ok(_) => {}
+            // Gone in the meantime.
+            Err(error) if error.kind() == ErrorKind::NotFound => {}
+            Err(error) => return Err(error),
         }
     }
     Ok(found)

@@ -1,15 +1,11 @@
 //! How costs grow: with agents, with entities, with actors.
 
 use super::{Measured, Report, learner, rollout};
-use crate::failure::Failure;
+use crate::{child, failure::Failure};
 use rit_env::{Task, particle::PredatorPreyReward};
 use rustix::param::clock_ticks_per_second;
 use serde_json::{Value, json};
-use std::{
-    fs,
-    process::{Command, Stdio},
-    time::Duration,
-};
+use std::{fs, process::Stdio, time::Duration};
 
 /// Agents, or prey, of one task.
 const SIZES: [usize; 5] = [2, 4, 8, 16, 32];
@@ -70,7 +66,7 @@ fn whole_run(
 ) -> Result<Value, Failure> {
     let folder = tempfile::tempdir().map_err(Failure::runtime)?;
     let steps = (duration.as_secs_f64() * STEPS_A_SECOND).max(STEPS_A_SECOND) as u64;
-    let mut command = Command::new(std::env::current_exe().map_err(Failure::runtime)?);
+    let mut command = child::this_program();
     command.args(["train", experiment, "--json", "--run-dir"]).arg(folder.path().join("run"));
     command.args(["--actors", &actors.to_string(), "--steps", &steps.to_string()]);
     command.args(settings.iter().flat_map(|setting| ["--set", setting]));

@@ -124,7 +124,7 @@ mod tests {
         *,
     };
     use crate::cli::PlotMetric;
-    use rit_config::{Config, RunDir, resolve, set};
+    use rit_config::{Config, OwnedRunDir, resolve, set};
     use std::{fs, path::Path};
 
     fn config(settings: &[&str]) -> Config {
@@ -146,7 +146,7 @@ mod tests {
     }
 
     fn run_dir(folder: &Path, name: &str, settings: &[&str], text: &str) -> Run {
-        let run_dir = RunDir::create(&folder.join(name), &config(settings)).unwrap();
+        let run_dir = OwnedRunDir::create(&folder.join(name), &config(settings)).unwrap().run_dir().clone();
         fs::write(run_dir.metrics(), text).unwrap();
         let mut run = read(run_dir.root(), PlotMetric::MeanReturn).unwrap();
         run.name = name.to_owned();

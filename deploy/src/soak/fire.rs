@@ -1,6 +1,6 @@
 //! A run whose processes are killed.
 
-use crate::{control, failure::Failure, last_words::last_words};
+use crate::{child, control, failure::Failure, last_words::last_words};
 use rand::RngExt as _;
 use rit_config::RunDir;
 use rit_episode::Rng;
@@ -283,7 +283,7 @@ impl Run {
 /// Starts `rit train`; what it says goes to a file beside the run's directory.
 fn train(arguments: &[String], root: &Path) -> Result<Child, Failure> {
     let log = File::options().create(true).append(true).open(log(root)).map_err(Failure::runtime)?;
-    Command::new(std::env::current_exe().map_err(Failure::runtime)?)
+    Command::from(child::this_program())
         .args(["train", "--json"])
         .args(arguments)
         .stdin(Stdio::null())

@@ -6,7 +6,7 @@ mod fire;
 use crate::{cli::SoakOptions, experiments, failure::Failure, output};
 use fire::{Kill, Run, Victim};
 use rit_config::RunDir;
-use rit_episode::{Episode, RunSeed, Stream};
+use rit_episode::{Episode, RunSeed, Stream, wire::Expected};
 use rit_learner::replay_log;
 use serde::Serialize;
 use serde_json::Value;
@@ -58,7 +58,11 @@ pub async fn run(options: SoakOptions) -> Result<ExitCode, Failure> {
     settings.push(format!("actors.count={}", options.actors));
     let config = experiments::load(&options.experiment, &settings)?.config;
     let every = (config.training.t_max / (2 * options.kills as u64 + 1)).max(1);
-    fs::create_dir_all(folder).map_err(Failure::runtime)?;
+    if let Some(parent) = folder.parent() {
+        fs::create_dir_all(parent).map_err(Failure::runtime)?;
+    }
+    // Of two that do so at once, one has it.
+    fs::create_dir(folder).map_err(Failure::runtime)?;
 
     let say = |words: &str| {
         if !options.json {
@@ -129,7 +133,7 @@ fn replay(root: &Path) -> Result<Vec<Episode>, Failure> {
     let summary: Value = serde_json::from_slice(&summary).map_err(Failure::runtime)?;
     let end = summary["episodes"].as_u64().unwrap_or_default();
     let numbers = end.saturating_sub(config.algorithm.buffer_size as u64)..end;
-    let expected = rit_learner::expected(&run_dir, &config);
+    let expected = Expected { run_id: run_dir.lineage(), ..rit_learner::expected(&run_dir, &config) };
     replay_log::read(&run_dir.replay(), &expected, numbers).map_err(Failure::runtime)
 }
 

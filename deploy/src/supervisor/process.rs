@@ -1,16 +1,11 @@
 //! The child processes of `rit train`: this program, executed again.
 
 use super::{Exit, Place};
-use crate::{last_words::last_words, logging::LogOptions};
-use std::{
-    collections::BTreeMap,
-    fs::OpenOptions,
-    io,
-    path::{Path, PathBuf},
-    process::{ExitStatus, Stdio},
-};
+use crate::{child, last_words::last_words, logging::LogOptions};
+use rit_config::OwnedRunDir;
+use std::{collections::BTreeMap, fs, io, path::PathBuf, process::ExitStatus};
 use tokio::{
-    process::{Child, ChildStdin, Command},
+    process::{Child, ChildStdin},
     sync::oneshot,
     task::JoinSet,
 };
@@ -18,7 +13,7 @@ use tokio::{
 /// The processes there are, by their places.
 #[derive(Debug)]
 pub struct Processes<'a> {
-    run_dir: &'a Path,
+    owned: &'a OwnedRunDir,
     logs: PathBuf,
     log_options: &'a LogOptions,
     handles: BTreeMap<Place, Handle>,
@@ -38,11 +33,11 @@ struct Handle {
 }
 
 impl<'a> Processes<'a> {
-    /// None yet; those of the run in `run_dir`, which log to `logs`.
-    pub fn new(run_dir: &'a Path, logs: PathBuf, log_options: &'a LogOptions) -> Self {
+    /// None yet; those of this run.
+    pub fn new(owned: &'a OwnedRunDir, log_options: &'a LogOptions) -> Self {
         Self {
-            run_dir,
-            logs,
+            owned,
+            logs: owned.run_dir().logs(),
             log_options,
             handles: BTreeMap::new(),
             log_begins_at: BTreeMap::new(),
@@ -55,27 +50,23 @@ impl<'a> Processes<'a> {
     /// # Errors
     /// When the system refuses.
     pub fn start(&mut self, place: Place) -> io::Result<Option<u32>> {
-        let log = OpenOptions::new().create(true).append(true).open(self.log(place))?;
-        self.log_begins_at.insert(place, log.metadata()?.len());
-        let mut command = Command::new(std::env::current_exe()?);
+        let log = self.log(place);
+        self.log_begins_at.insert(place, fs::metadata(&log).map_or(0, |metadata| metadata.len()));
+        let mut command = child::this_program();
         match place {
             Place::Learner => command.arg("learner"),
             Place::Actor(slot) => {
                 command.args(["actor", "--name", &place.to_string(), "--slot", &slot.to_string()])
             }
         };
-        let mut child = command
+        command
             .arg("--run-dir")
-            .arg(self.run_dir)
+            .arg(self.owned.run_dir().root())
             .arg("--supervised")
-            .args(self.log_options.arguments())
-            .stdin(Stdio::piped())
-            .stdout(Stdio::null())
-            .stderr(log)
-            // A terminal's Ctrl-C reaches this process alone, which then ends the others in order.
-            .process_group(0)
-            .kill_on_drop(true)
-            .spawn()?;
+            .args(self.log_options.arguments());
+        // An actor writes nothing to the run directory.
+        let lock = self.owned.lock().filter(|_| place == Place::Learner);
+        let mut child = child::spawn(command, &log, lock)?;
         let (kill, killed) = oneshot::channel();
         self.handles.insert(place, Handle { lifeline: child.stdin.take(), kill: Some(kill) });
         let pid = child.id();

@@ -1,11 +1,9 @@
 //! Around the supervisor: the processes, the clock, and the way to the learner.
 
 use super::{Effect, Event, Exit, Hung, Outcome, Place, Standing, Supervisor, process::Processes};
-use crate::{
-    control, logging::LogOptions, progress::Progress, shutdown, train::remove_shared_memory,
-    warnings::Warnings,
-};
-use rit_config::RunDir;
+use crate::{control, logging::LogOptions, progress::Progress, shutdown, warnings::Warnings};
+use rit_config::{OwnedRunDir, RunDir};
+use rit_learner::life;
 use rit_proto::{
     transport::Client,
     v1::{RunState, RunStatus, StatusRequest, StopRequest, control_client::ControlClient},
@@ -28,21 +26,22 @@ enum Contacted {
 
 type Contact<'a> = Pin<Box<dyn Future<Output = Contacted> + 'a>>;
 
-/// Starts the processes of a run with so many actors, and watches over them until all have ended for good.
+/// Starts the processes of a run with so many actors, and watches over them until all have ended for good. The second
+/// value says whether the run has begun: a learner has answered.
 pub async fn watch_over(
-    run_dir: &RunDir,
+    owned: &OwnedRunDir,
     log_options: &LogOptions,
     progress: &mut Progress,
     actors: u32,
-) -> Outcome {
-    let logs = run_dir.logs();
+) -> (Outcome, bool) {
+    let run_dir = owned.run_dir();
     let mut shell = Shell {
-        supervisor: Supervisor::new(actors, logs.display().to_string()),
+        supervisor: Supervisor::new(actors, run_dir.logs().display().to_string()),
         began: Instant::now(),
         run_dir,
         progress,
         warnings: Warnings::default(),
-        processes: Processes::new(run_dir.root(), logs, log_options),
+        processes: Processes::new(owned, log_options),
         control: None,
         contact: Box::pin(std::future::pending()),
         web_url: None,
@@ -53,7 +52,7 @@ pub async fn watch_over(
     let mut event = Event::Begin;
     loop {
         if let Some(outcome) = shell.handle(event) {
-            return outcome;
+            return (outcome, shell.supervisor.has_begun());
         }
         let deadline = shell.supervisor.deadline().map(|at| shell.began + at);
         event = tokio::select! {
@@ -102,7 +101,7 @@ impl Shell<'_> {
                     Effect::AskToEnd(place) => self.processes.ask_to_end(place),
                     Effect::Kill(place) => self.processes.kill(place),
                     Effect::StopRun => self.stop_run(),
-                    Effect::RemoveSharedMemory => remove_shared_memory(self.run_dir),
+                    Effect::RemoveSharedMemory => life::remove_dead(self.run_dir),
                     Effect::Say(line) => self.progress.say(&line),
                     Effect::Over(outcome) => return Some(outcome),
                 }

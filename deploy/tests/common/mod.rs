@@ -158,10 +158,19 @@ impl Train {
 
     /// Trains on from where the run of this folder stands.
     pub fn resume(folder: &RunFolder, arguments: &[&str]) -> Self {
-        let run_dir = folder.run_dir();
+        Self::resume_in(&folder.run_dir(), arguments)
+    }
+
+    /// Trains on from where the run in this directory stands.
+    pub fn resume_in(run_dir: &Path, arguments: &[&str]) -> Self {
         let mut command = rit(&["train", "--json", "--resume", run_dir.to_str().unwrap()]);
         let child = command.args(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-        Self { child: Some(child), run_dir }
+        Self { child: Some(child), run_dir: run_dir.to_owned() }
+    }
+
+    /// The process of `rit train` itself.
+    pub fn pid(&self) -> u32 {
+        self.child.as_ref().unwrap().id()
     }
 
     /// Waits for the end.
@@ -221,10 +230,11 @@ pub fn pids(status: &Value) -> Vec<u32> {
 /// What the run has left in shared memory: nothing, if all is well.
 pub fn shared_memory_of(run_dir: &Path) -> Vec<PathBuf> {
     let (run_dir, _) = rit_config::RunDir::open(run_dir).unwrap();
-    let space = rit_ipc::RunSpace::new(&run_dir.shared_memory_root()).unwrap();
-    let mut left = space.leftovers().unwrap();
-    left.extend(space.directory().exists().then(|| space.directory().to_owned()));
-    left
+    match fs::read_to_string(run_dir.shared_memory()) {
+        Ok(place) => rit_ipc::RunSpace::new(Path::new(place.trim_end())).unwrap().leftovers().unwrap(),
+        // No life of the run has left a place.
+        Err(_) => Vec::new(),
+    }
 }
 
 /// The objects of a file of one JSON object a line.

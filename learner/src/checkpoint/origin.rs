@@ -13,7 +13,7 @@ pub const FORMAT_VERSION: u32 = 1;
 pub struct Origin {
     /// See [`FORMAT_VERSION`]; 0 in checkpoints from before there was one.
     pub format_version: u32,
-    /// The run, in hexadecimal.
+    /// The run, in hexadecimal; of a copied run the first one.
     pub run_id: String,
     /// Every key of the configuration that weights follow from, with its value.
     pub settings: BTreeMap<String, String>,
@@ -56,7 +56,7 @@ impl Origin {
     /// # Errors
     /// When the configuration cannot be written down.
     pub fn of(run_dir: &RunDir, config: &Config) -> Result<Self, ConfigError> {
-        let run_id = run_dir.run_id().iter().map(|byte| format!("{byte:02x}")).collect();
+        let run_id = run_dir.lineage().iter().map(|byte| format!("{byte:02x}")).collect();
         Ok(Self { format_version: FORMAT_VERSION, run_id, settings: config.result_settings()? })
     }
 

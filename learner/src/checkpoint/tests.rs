@@ -1,6 +1,6 @@
 use super::*;
 use crate::{evaluation::Exploring, ledger::Terms, tensorboard::Position};
-use rit_config::Config;
+use rit_config::{Config, OwnedRunDir};
 use rit_episode::{
     RunSeed, Stream,
     wire::{Expected, PayloadLayout, TaskSize},
@@ -24,7 +24,7 @@ fn run() -> Run {
     let mut config = rit_config::resolve("environment.task_set = \"matrix-game\"", "test", &[]).unwrap();
     config.algorithm.buffer_size = 0;
     let folder = tempfile::tempdir().unwrap();
-    let run_dir = RunDir::create(&folder.path().join("run"), &config).unwrap();
+    let run_dir = OwnedRunDir::create(&folder.path().join("run"), &config).unwrap().run_dir().clone();
     let model = Arc::new(Model::new(config.model()).unwrap());
     let params = model.initial(&mut RunSeed(1).stream(Stream::Weights, 0));
     let learner = rit_algo::learner(model, config.update(), params).unwrap();

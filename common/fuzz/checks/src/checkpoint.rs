@@ -2,7 +2,7 @@
 
 use crate::frame;
 use rit_algo::{Learner, Model, learner::NamedState};
-use rit_config::{Config, RunDir};
+use rit_config::{Config, OwnedRunDir, RunDir};
 use rit_env::{Split, TaskSet};
 use rit_episode::{
     Episode, Stream,
@@ -76,7 +76,7 @@ impl Run {
         let folder = tempfile::Builder::new().prefix("rit-fuzz-").tempdir()?;
         let config = rit_config::resolve(EXPERIMENT, "experiment", &[])?;
         let root = folder.path().join("run");
-        RunDir::create(&root, &config)?;
+        OwnedRunDir::create(&root, &config)?;
         fs::write(root.join("run_id"), RUN_ID)?;
         let (run_dir, config) = RunDir::open(&root)?;
         let model = Arc::new(Model::new(config.model())?);

@@ -1,0 +1,161 @@
+//! One writer a run: an OS lock on the run's directory. It ends with the processes that hold it, however they end.
+
+use crate::RunDirError;
+use rustix::{fs::FlockOperation, io::Errno};
+use std::{
+    fs::{self, File, OpenOptions},
+    io::{self, Write as _},
+    os::{
+        fd::{AsFd, BorrowedFd},
+        unix::fs::{MetadataExt as _, OpenOptionsExt as _},
+    },
+    path::{Path, PathBuf},
+    process, thread,
+    time::{Duration, Instant},
+};
+
+/// Who has the lock, a process a line, the one that took it first. Where a file system locks no folders (NFS), the
+/// lock is on this file.
+pub(crate) const LOCK: &str = "lock";
+
+/// How long a run's processes are waited for whose first has died: they are about to end.
+const ORPHANS_TIMEOUT: Duration = Duration::from_secs(15);
+
+/// From one look whether they have to the next.
+const LOOK_EVERY: Duration = Duration::from_millis(20);
+
+/// A run's lock. Whoever writes to a run's directory has it, or was handed it by the process that started it.
+#[derive(Debug)]
+pub struct RunLock {
+    locked: File,
+}
+
+impl RunLock {
+    /// The descriptor at which a child process finds the lock that its parent hands down. While the child lives, the
+    /// lock is held, though the parent die.
+    pub const CHILD_FD: i32 = 3;
+
+    /// Takes the lock of an existing directory. Makes and changes nothing there, but where only files can be locked.
+    ///
+    /// # Errors
+    /// When another run has it, or the system knows no locks there.
+    pub(crate) fn take(root: &Path) -> Result<Self, RunDirError> {
+        let begun = Instant::now();
+        loop {
+            if let Some(locked) = try_lock(root)? {
+                return Ok(Self { locked });
+            }
+            let holders = holders(root);
+            let living = holders.iter().copied().find(|&pid| is_alive(pid));
+            let first_lives = living.is_some() && living == holders.first().copied();
+            if first_lives || begun.elapsed() >= ORPHANS_TIMEOUT {
+                return Err(RunDirError::InUse { root: root.to_owned(), holder: living });
+            }
+            thread::sleep(LOOK_EVERY);
+        }
+    }
+
+    /// Whether the process that started this one has handed the run's lock down.
+    pub(crate) fn is_handed_down(root: &Path) -> bool {
+        let at = |path: PathBuf| fs::metadata(path).map(|metadata| (metadata.dev(), metadata.ino())).ok();
+        let handed = at(format!("/proc/self/fd/{}", Self::CHILD_FD).into());
+        let ours = [at(root.to_owned()), at(root.join(LOCK))];
+        handed.is_some() && ours.contains(&handed) && matches!(try_lock(root), Ok(None))
+    }
+
+    /// Says who has the lock, for the message to whoever wants it too.
+    pub(crate) fn tell_holder(root: &Path, is_first: bool) {
+        let mut options = OpenOptions::new();
+        options.create(true).mode(0o600);
+        let file = if is_first { options.write(true).truncate(true) } else { options.append(true) };
+        // The lock holds without it: only the message is poorer.
+        let _ = file.open(root.join(LOCK)).and_then(|mut file| writeln!(file, "{}", process::id()));
+    }
+}
+
+impl AsFd for RunLock {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.locked.as_fd()
+    }
+}
+
+/// The lock, or nothing if it is taken.
+fn try_lock(root: &Path) -> Result<Option<File>, RunDirError> {
+    let failed = |error: io::Error| RunDirError::Io { path: root.to_owned(), error };
+    let folder = File::open(root).map_err(failed)?;
+    match rustix::fs::flock(&folder, FlockOperation::NonBlockingLockExclusive) {
+        Ok(()) => return Ok(Some(folder)),
+        Err(Errno::WOULDBLOCK) => return Ok(None),
+        // NFS locks what can be written to, and a folder cannot.
+        Err(Errno::BADF | Errno::NOLCK | Errno::OPNOTSUPP | Errno::INVAL | Errno::ISDIR) => {}
+        Err(error) => return Err(failed(error.into())),
+    }
+    let path = root.join(LOCK);
+    let mut options = OpenOptions::new();
+    let file = options.create(true).append(true).mode(0o600).open(&path).map_err(failed)?;
+    match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
+        Ok(()) => Ok(Some(file)),
+        Err(Errno::WOULDBLOCK) => Ok(None),
+        Err(error) => Err(RunDirError::Io { path, error: error.into() }),
+    }
+}
+
+fn holders(root: &Path) -> Vec<u32> {
+    let text = fs::read_to_string(root.join(LOCK)).unwrap_or_default();
+    text.lines().filter_map(|line| line.trim().parse().ok()).collect()
+}
+
+/// Whether a process runs; one that was killed and not yet waited for does not.
+fn is_alive(pid: u32) -> bool {
+    let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
+    // "PID (NAME) STATE …", and a name may hold anything.
+    let state = stat.rsplit_once(')').and_then(|(_, rest)| rest.trim_start().chars().next());
+    state.is_some_and(|state| !"ZX".contains(state))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_at_a_time_and_the_other_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let lock = RunLock::take(folder.path()).unwrap();
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0, "taking it makes nothing");
+        RunLock::tell_holder(folder.path(), true);
+        let error = RunLock::take(folder.path()).unwrap_err();
+        assert!(
+            matches!(error, RunDirError::InUse { holder: Some(pid), .. } if pid == process::id()),
+            "{error}"
+        );
+        assert!(error.to_string().contains(&format!("process {}", process::id())), "{error}");
+        drop(lock);
+        RunLock::take(folder.path()).unwrap();
+    }
+
+    #[test]
+    fn the_processes_of_a_first_that_has_died_are_waited_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut first = process::Command::new("true").spawn().unwrap();
+        let dead = first.id();
+        first.wait().unwrap();
+        let lock = RunLock::take(folder.path()).unwrap();
+        fs::write(folder.path().join(LOCK), format!("{dead}\n{}\n", process::id())).unwrap();
+        let root = folder.path().to_owned();
+        let waiting = thread::spawn(move || RunLock::take(&root).map(drop));
+        // Whichever comes first, this end or that look: it gets the lock.
+        drop(lock);
+        waiting.join().unwrap().unwrap();
+    }
+
+    #[test]
+    fn a_zombie_does_not_run() {
+        let mut child = process::Command::new("true").spawn().unwrap();
+        assert!(is_alive(process::id()));
+        // Ended, and not waited for.
+        while is_alive(child.id()) {
+            thread::yield_now();
+        }
+        child.wait().unwrap();
+    }
+}

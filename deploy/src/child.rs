@@ -1,0 +1,63 @@
+//! How this program starts itself again, as a child process.
+
+use command_fds::{CommandFdExt as _, FdMapping};
+use rit_config::RunLock;
+use std::{
+    fs::{self, DirBuilder, OpenOptions},
+    io,
+    os::{
+        fd::BorrowedFd,
+        unix::{
+            fs::{DirBuilderExt as _, OpenOptionsExt as _},
+            process::CommandExt as _,
+        },
+    },
+    path::Path,
+    process::{Command, Stdio},
+};
+use tokio::process::Child;
+
+/// The program, as children are told it and as process lists show it.
+const PROGRAM: &str = "rit";
+
+/// A command that executes the program that is running, whatever has become of its file since: replaced by another
+/// build, moved, removed.
+pub fn this_program() -> Command {
+    let mut command = Command::new("/proc/self/exe");
+    command.arg0(PROGRAM);
+    command
+}
+
+/// Gives this process the program's name, which one that was started by [`this_program`] lacks.
+pub fn take_name() {
+    const NAME: &str = "/proc/self/comm";
+    if fs::read_to_string(NAME).is_ok_and(|name| name.trim_end() == "exe") {
+        // For people's eyes alone.
+        let _ = fs::write(NAME, PROGRAM);
+    }
+}
+
+/// Starts a command of [`this_program`]; its standard error is appended to a file, its standard input is a pipe, and it
+/// is handed the run's lock, if one is given.
+///
+/// # Errors
+/// When the system refuses.
+pub fn spawn(mut command: Command, log: &Path, lock: Option<BorrowedFd<'_>>) -> io::Result<Child> {
+    if let Some(folder) = log.parent() {
+        // Somebody may have removed it since the run began.
+        DirBuilder::new().recursive(true).mode(0o700).create(folder)?;
+    }
+    let log = OpenOptions::new().create(true).append(true).mode(0o600).open(log)?;
+    command
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .stderr(log)
+        // A terminal's Ctrl-C reaches this process alone, which then ends the others in order.
+        .process_group(0);
+    if let Some(lock) = lock {
+        let parent_fd = lock.try_clone_to_owned()?;
+        let mapping = FdMapping { parent_fd, child_fd: RunLock::CHILD_FD };
+        command.fd_mappings(vec![mapping]).map_err(io::Error::other)?;
+    }
+    tokio::process::Command::from(command).kill_on_drop(true).spawn()
+}
