@@ -7,6 +7,7 @@ use crate::{
     math::{self, Lanes, each, load, store},
     vectorized,
 };
+use std::ops::Range;
 
 /// Who asks and who is asked.
 #[derive(Clone, Copy)]
@@ -123,15 +124,13 @@ vectorized! {
                     let (own_key, own_value) = (tokens.key(row), tokens.value(row));
                     let d_hidden = &mut d_hidden[row * 2 * a..][..2 * a];
                     let d_query = &mut d_queries[row * a..][..a];
-                    let along = |value: &[f32]| math::dot(&d_out[head.clone()], &value[head.clone()]);
-                    let own = along(own_value);
+                    let own = along(d_out, own_value, &head);
                     let mut mean = weights_here[others] * own;
                     for (key, weight) in weights_here[..others].iter().enumerate() {
                         // Worked out again below: shorter than to keep it.
-                        mean = weight.mul_add(along(values.row(key)), mean);
+                        mean = weight.mul_add(along(d_out, values.row(key), &head), mean);
                     }
-                    let d_score = |weight: f32, along: f32| weight * (along - mean) * scale(head_dim);
-                    let d_own = d_score(weights_here[others], own);
+                    let d_own = weights_here[others] * (own - mean) * scale(head_dim);
                     for_lanes!(head.clone(), |at, len| {
                         let key = load(own_key, at, len);
                         store(each(|lane| d_own * key[lane]), d_query, at, len);
@@ -143,7 +142,7 @@ vectorized! {
                         if weight == 0.0 {
                             continue;
                         }
-                        let d_score = d_score(weight, along(values.row(key)));
+                        let d_score = weight * (along(d_out, values.row(key), &head) - mean) * scale(head_dim);
                         let d_entity = &mut d_entities[key * 2 * a..][..2 * a];
                         for_lanes!(head.clone(), |at, len| {
                             add_to(d_query, at, len, d_score, keys.row(key), at);
@@ -171,6 +170,12 @@ impl<'a> Tokens<'a> {
         let a = self.queries.cols;
         &self.hidden[row * 2 * a + a..][..a]
     }
+}
+
+/// d_out · value, over a head's columns.
+#[inline(always)]
+fn along(d_out: &[f32], value: &[f32], head: &Range<usize>) -> f32 {
+    math::dot(&d_out[head.clone()], &value[head.clone()])
 }
 
 /// sum + weight · x, in the `len` columns from `at` on.
