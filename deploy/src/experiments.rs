@@ -95,10 +95,8 @@ pub fn print() -> Result<ExitCode, Failure> {
     let experiments = EXPERIMENTS.map(|(name, text)| {
         format!("  {name:38} {}\n", text.lines().next().unwrap_or_default().trim_start_matches("# "))
     });
-    let algorithms = Method::ALL.map(Method::facts).map(|facts| {
-        let not_yet = if facts.built { "" } else { " (not built yet)" };
-        format!("  {:38} {}{not_yet}\n", facts.name, facts.summary)
-    });
+    let algorithms = Method::ALL.map(Method::facts);
+    let algorithms = algorithms.map(|facts| format!("  {:38} {}\n", facts.name, facts.summary));
     output::print(&format!(
         "experiments: task sets with their settings, `rit train EXPERIMENT`\n{}\nalgorithms: any of them on any task set, \
          `rit train EXPERIMENT --algorithm NAME`\n{}",

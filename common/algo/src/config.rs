@@ -7,7 +7,7 @@ use crate::{
 use rit_nn::OptimizerKind;
 
 /// What a [`Model`](crate::Model) is made from. A method takes the sizes that it has a use for.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct ModelConfig {
     /// The algorithm.
     pub method: Method,
@@ -37,6 +37,45 @@ pub struct ModelConfig {
     pub mixing_embed_dim: usize,
     /// Hidden size of the hyper-networks.
     pub hypernet_embed_dim: usize,
+    /// f: hidden size of UPDeT's feed-forward layers.
+    pub feedforward_dim: usize,
+    /// λ: what REFIL's imagined loss counts, out of 1.
+    pub imagined_weight: f32,
+    /// ROMA's roles.
+    pub role: RoleConfig,
+}
+
+/// Sizes and losses of ROMA's roles. The default is the supplement's.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RoleConfig {
+    /// l: numbers in a role.
+    pub dim: usize,
+    /// r: hidden size of whatever is made of roles, or makes them.
+    pub hidden_dim: usize,
+    /// No variance of a role is less.
+    pub variance_floor: f32,
+    /// w_H.
+    pub entropy_weight: f32,
+    /// w_KL.
+    pub kl_weight: f32,
+    /// w_D.
+    pub dissimilarity_weight: f32,
+    /// κ.
+    pub soft_constraint: f32,
+}
+
+impl Default for RoleConfig {
+    fn default() -> Self {
+        Self {
+            dim: 3,
+            hidden_dim: 16,
+            variance_floor: 0.002,
+            entropy_weight: 1e-4,
+            kl_weight: 1e-4,
+            dissimilarity_weight: 1e-3,
+            soft_constraint: 1.0,
+        }
+    }
 }
 
 /// A model that cannot be.
@@ -58,17 +97,6 @@ pub enum ConfigError {
         /// Heads.
         n_heads: usize,
     },
-    /// A method that is known and not there yet.
-    #[error("the algorithm {method} is not built yet; these are: {}", built())]
-    NotBuilt {
-        /// It.
-        method: Method,
-    },
-}
-
-fn built() -> String {
-    let built = Method::ALL.map(Method::facts).into_iter().filter(|facts| facts.built);
-    built.map(|facts| facts.name).collect::<Vec<_>>().join(", ")
 }
 
 impl ModelConfig {
@@ -78,9 +106,6 @@ impl ModelConfig {
     /// The first thing that no model can have.
     pub fn validate(&self) -> Result<(), ConfigError> {
         let facts = self.method.facts();
-        if !facts.built {
-            return Err(ConfigError::NotBuilt { method: self.method });
-        }
         let mut sizes = vec![
             ("entity_dim", self.entity_dim),
             ("n_actions", self.n_actions),
@@ -106,6 +131,12 @@ impl ModelConfig {
                 ("mixing_embed_dim", self.mixing_embed_dim),
                 ("hypernet_embed_dim", self.hypernet_embed_dim),
             ]);
+        }
+        if facts.encoder == Encoder::Tokens {
+            sizes.push(("feedforward_dim", self.feedforward_dim));
+        }
+        if self.method == Method::Roma {
+            sizes.extend([("role_dim", self.role.dim), ("role_hidden_dim", self.role.hidden_dim)]);
         }
         if let Some((name, _)) = sizes.into_iter().find(|(_, size)| *size == 0) {
             return Err(ConfigError::Zero { name });

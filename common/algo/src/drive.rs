@@ -9,5 +9,6 @@ pub mod td;
 pub use acting::ValueActing;
 pub use shards::{Sums, tree_sum, tree_sum_f64};
 pub use td::{
-    Head, Pass, Role, SeenShard, TdLearner, TdPass, Totals, Utilities, ValueNetwork, ValueParts, measures,
+    Head, Pass, Role, Said, SeenShard, TdLearner, TdPass, Totals, Utilities, ValueNetwork, ValueParts,
+    measures,
 };

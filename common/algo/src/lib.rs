@@ -21,7 +21,7 @@ mod model;
 pub mod on_policy;
 mod rows;
 
-pub use config::{ConfigError, ModelConfig, PpoConfig, UpdateConfig};
+pub use config::{ConfigError, ModelConfig, PpoConfig, RoleConfig, UpdateConfig};
 pub use learner::Learner;
 pub use method::{Method, Regime};
 pub use methods::{

@@ -3,8 +3,14 @@
 pub mod mappo;
 pub mod mat;
 mod recurrent;
+pub mod refil;
+pub mod roma;
+mod updet;
 
 pub use recurrent::Recurrent;
+pub use refil::Refil;
+pub use roma::Roma;
+pub use updet::Updet;
 
 use crate::{
     Learner, Model, UpdateConfig,
@@ -33,6 +39,9 @@ pub fn learner(
         Network::Recurrent(network) => Box::new(TdLearner::new(model, network, update, params)?),
         Network::Mappo(network) => Box::new(PpoLearner::new(model, network, update, params)?),
         Network::Mat(network) => Box::new(PpoLearner::new(model, network, update, params)?),
+        Network::Updet(network) => Box::new(TdLearner::new(model, network, update, params)?),
+        Network::Refil(network) => Box::new(TdLearner::new(model, network, update, params)?),
+        Network::Roma(network) => Box::new(TdLearner::new(model, network, update, params)?),
     })
 }
 
@@ -58,6 +67,9 @@ impl Acting {
             Network::Recurrent(network) => Box::new(ValueActing::new(network, params)),
             Network::Mappo(network) => Box::new(MappoActing::new(network, params)),
             Network::Mat(network) => Box::new(MatActing::new(network, params)),
+            Network::Updet(network) => Box::new(ValueActing::new(network, params)),
+            Network::Refil(network) => Box::new(ValueActing::new(network, params)),
+            Network::Roma(network) => Box::new(ValueActing::new(network, params)),
         })
     }
 

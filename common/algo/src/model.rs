@@ -1,8 +1,11 @@
 //! A method's networks: which parameters they have, and which of these acting needs.
 
 use crate::{
-    ConfigError, Mappo, MappoConfig, Mat, MatConfig, Method, ModelConfig, drive::ValueNetwork as _,
-    flat::Slots, methods::Recurrent, on_policy::ActorCritic as _,
+    ConfigError, Mappo, MappoConfig, Mat, MatConfig, Method, ModelConfig,
+    drive::ValueNetwork as _,
+    flat::Slots,
+    methods::{Recurrent, Refil, Roma, Updet},
+    on_policy::ActorCritic as _,
 };
 use rit_episode::Rng;
 use rit_nn::Layout;
@@ -24,6 +27,12 @@ pub(crate) enum Network {
     Mappo(Arc<Mappo>),
     /// MAT's.
     Mat(Arc<Mat>),
+    /// UPDeT's.
+    Updet(Arc<Updet>),
+    /// REFIL's.
+    Refil(Arc<Refil>),
+    /// ROMA's.
+    Roma(Arc<Roma>),
 }
 
 impl Model {
@@ -44,6 +53,9 @@ impl Model {
                 let sizes = MatConfig { slots, n_actions, embed_dim, n_heads, n_blocks };
                 Network::Mat(Arc::new(Mat::new(sizes)))
             }
+            Method::UpdetMix | Method::UpdetVdn => Network::Updet(Arc::new(Updet::new(&config))),
+            Method::Refil => Network::Refil(Arc::new(Refil::new(&config))),
+            Method::Roma => Network::Roma(Arc::new(Roma::new(&config))),
             _ => Network::Recurrent(Arc::new(Recurrent::new(&config))),
         };
         Ok(Self { config, network })
@@ -63,6 +75,9 @@ impl Model {
     pub fn layout(&self) -> &Layout {
         match &self.network {
             Network::Recurrent(network) => &network.parts().layout,
+            Network::Updet(network) => &network.parts().layout,
+            Network::Refil(network) => &network.parts().layout,
+            Network::Roma(network) => &network.parts().layout,
             Network::Mappo(network) => network.layout(),
             Network::Mat(network) => network.layout(),
         }
@@ -72,6 +87,9 @@ impl Model {
     pub fn acting(&self) -> Range<usize> {
         match &self.network {
             Network::Recurrent(network) => network.parts().acting.clone(),
+            Network::Updet(network) => network.parts().acting.clone(),
+            Network::Refil(network) => network.parts().acting.clone(),
+            Network::Roma(network) => network.parts().acting.clone(),
             Network::Mappo(network) => network.acting(),
             Network::Mat(network) => network.acting(),
         }

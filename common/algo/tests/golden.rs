@@ -6,6 +6,8 @@
 
 #[path = "golden/on_policy.rs"]
 mod on_policy;
+#[path = "golden/rivals.rs"]
+mod rivals;
 #[path = "golden/value.rs"]
 mod value;
 

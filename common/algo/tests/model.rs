@@ -1,14 +1,16 @@
 //! The whole model on small random batches: numeric gradients of every parameter, acting against training,
 //! and independence of threads and of company.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "helpers of tests are tests too")]
+#![allow(clippy::let_unit_value, reason = "some methods draw nothing")]
 
 use rand::RngExt as _;
 use rit_algo::{
-    Method, Model, ModelConfig, PpoConfig, TerminalStates, UpdateConfig,
+    Learner as _, Method, Model, ModelConfig, PpoConfig, RoleConfig, TerminalStates, UpdateConfig,
     blocks::draw_pairing,
-    drive::{SeenShard, TdLearner, ValueActing, ValueNetwork as _},
+    drive::{SeenShard, TdLearner, ValueActing, ValueNetwork},
+    learner::Draw,
     method::Encoder,
-    methods::Recurrent,
+    methods::{Recurrent, Refil, Roma, Updet, refil::Groups, roma::RoleNoise},
 };
 use rit_episode::{
     Choice, End, Episode, Exploration, Observation, Policy, Rng, RunSeed, Stream, Turn, decision_order,
@@ -23,7 +25,7 @@ const D: usize = 5;
 const A: usize = 3;
 
 /// Every method of these networks, the encoder's option, and both numbers of heads.
-const CASES: [(Method, Encoder, usize); 9] = [
+const CASES: [Case; 15] = [
     (Method::Rit, Encoder::Beside, 1),
     (Method::Rit, Encoder::Beside, 2),
     (Method::RitVdn, Encoder::Beside, 2),
@@ -32,17 +34,121 @@ const CASES: [(Method, Encoder, usize); 9] = [
     (Method::QmixAttn, Encoder::Beside, 1),
     (Method::VdnAttn, Encoder::Within, 1),
     (Method::QmixInt, Encoder::Within, 1),
+    (Method::UpdetMix, Encoder::Tokens, 2),
+    (Method::UpdetVdn, Encoder::Tokens, 1),
+    (Method::Refil, Encoder::Within, 2),
+    (Method::Roma, Encoder::Beside, 1),
+    (Method::Roma, Encoder::Within, 2),
+    (Method::Refil, Encoder::Beside, 1),
     (Method::VdnInt, Encoder::Within, 2),
 ];
 
-/// A method's networks.
-struct Networks {
-    model: Arc<Model>,
-    network: Arc<Recurrent>,
+type Case = (Method, Encoder, usize);
+
+/// Runs the block for each of the cases, with its [`Networks`] under the given name.
+macro_rules! each {
+    ($cases:expr, |$networks:ident| $body:block) => {
+        for &case in $cases {
+            match case.0 {
+                Method::UpdetMix | Method::UpdetVdn => {
+                    let $networks = Networks::new(case, Updet::new);
+                    $body
+                }
+                Method::Refil => {
+                    let $networks = Networks::new(case, Refil::new);
+                    $body
+                }
+                Method::Roma => {
+                    let $networks = Networks::new(case, Roma::new);
+                    $body
+                }
+                _ => {
+                    let $networks = Networks::new(case, Recurrent::new);
+                    $body
+                }
+            }
+        }
+    };
 }
 
-impl Networks {
-    fn new((method, encoder, n_heads): (Method, Encoder, usize)) -> Self {
+/// A method's networks.
+struct Networks<N> {
+    case: Case,
+    model: Arc<Model>,
+    network: Arc<N>,
+}
+
+/// How to treat what a method draws, and its losses.
+trait Drawn: ValueNetwork {
+    /// As acting without exploration has it.
+    fn quiet(_draws: &mut Self::Draws) {}
+
+    /// As it is where agent k is the former agent `orders[episode][k]`.
+    fn reorder(_draws: &mut Self::Draws, _orders: &[Vec<usize>]) {}
+
+    /// The whole loss, of its named parts.
+    fn loss(part: impl Fn(&str) -> f64) -> f64 {
+        part("td_loss") + part("contrastive_loss")
+    }
+}
+
+impl Drawn for Recurrent {}
+
+impl Drawn for Updet {}
+
+impl Drawn for Refil {
+    fn reorder(groups: &mut Groups, orders: &[Vec<usize>]) {
+        for (groups, order) in groups.iter_mut().zip(orders) {
+            let agents: Vec<u8> = order.iter().map(|&row| groups[row]).collect();
+            groups[..agents.len()].copy_from_slice(&agents);
+        }
+    }
+
+    fn loss(part: impl Fn(&str) -> f64) -> f64 {
+        let weight = f64::from(IMAGINED_WEIGHT);
+        (1.0 - weight) * part("td_loss") + weight * part("imagined_loss")
+    }
+}
+
+impl Drawn for Roma {
+    fn quiet(noise: &mut RoleNoise) {
+        noise.iter_mut().flatten().for_each(|noise| noise.fill(0.0));
+    }
+
+    fn reorder(noise: &mut RoleNoise, orders: &[Vec<usize>]) {
+        for (noise, order) in noise.iter_mut().zip(orders) {
+            for noise in noise {
+                for step in noise.chunks_mut(order.len() * ROLE.dim) {
+                    let before = step.to_vec();
+                    for (to, &row) in step.chunks_mut(ROLE.dim).zip(order) {
+                        to.copy_from_slice(&before[row * ROLE.dim..(row + 1) * ROLE.dim]);
+                    }
+                }
+            }
+        }
+    }
+
+    fn loss(part: impl Fn(&str) -> f64) -> f64 {
+        let weight = f64::from(ROLE.dissimilarity_weight);
+        part("td_loss") + part("role_loss") + weight * part("dissimilarity_loss")
+    }
+}
+
+/// Large, so that a wrong gradient shows.
+const IMAGINED_WEIGHT: f32 = 0.4;
+const ROLE: RoleConfig = RoleConfig {
+    dim: 2,
+    hidden_dim: 5,
+    variance_floor: 0.002,
+    entropy_weight: 0.3,
+    kl_weight: 0.05,
+    dissimilarity_weight: 0.5,
+    soft_constraint: 0.7,
+};
+
+impl<N: Drawn> Networks<N> {
+    fn new(case: Case, network: impl Fn(&ModelConfig) -> N) -> Self {
+        let (method, encoder, n_heads) = case;
         let config = ModelConfig {
             method,
             encoder,
@@ -58,9 +164,12 @@ impl Networks {
             reward_embed_dim: 2,
             mixing_embed_dim: 6,
             hypernet_embed_dim: 5,
+            feedforward_dim: 7,
+            imagined_weight: IMAGINED_WEIGHT,
+            role: ROLE,
         };
-        let network = Arc::new(Recurrent::new(&config));
-        Self { model: Arc::new(Model::new(config).unwrap()), network }
+        let network = Arc::new(network(&config));
+        Self { case, model: Arc::new(Model::new(config).unwrap()), network }
     }
 
     /// Parameters large enough that no gradient hides in rounding.
@@ -68,7 +177,7 @@ impl Networks {
         gradcheck::noise(seed, self.model.layout().len()).iter().map(|x| 0.7 * x).collect()
     }
 
-    fn learner(&self, shards: usize, threads: usize, params: Vec<f32>) -> TdLearner<Recurrent> {
+    fn learner(&self, shards: usize, threads: usize, params: Vec<f32>) -> TdLearner<N> {
         let config = UpdateConfig {
             gamma: 0.9,
             lr: 1e-2,
@@ -82,14 +191,27 @@ impl Networks {
         TdLearner::new(Arc::clone(&self.model), Arc::clone(&self.network), config, params).unwrap()
     }
 
-    fn acting(&self, params: &[f32]) -> ValueActing<Recurrent> {
+    /// What an update of these episodes draws.
+    fn draws(&self, batch: &[&Episode]) -> N::Draws {
+        self.network.draw(batch, Draw { seed: RunSeed(23), update: 0 })
+    }
+
+    fn quiet(&self, draws: &mut N::Draws) {
+        N::quiet(draws);
+    }
+
+    fn reorder(&self, draws: &mut N::Draws, orders: &[Vec<usize>]) {
+        N::reorder(draws, orders);
+    }
+
+    fn acting(&self, params: &[f32]) -> ValueActing<N> {
         ValueActing::new(Arc::clone(&self.network), &params[self.network.parts().acting.clone()])
     }
 }
 
-/// What learner measures, by name.
-fn measure(learner: &TdLearner<Recurrent>, values: &[f64], name: &str) -> f64 {
-    let measures = rit_algo::Learner::measures(learner);
+/// What a learner measures, by name; 0 where it does not.
+fn measure<N: Drawn>(learner: &TdLearner<N>, values: &[f64], name: &str) -> f64 {
+    let measures = learner.measures();
     let at = measures.iter().position(|measure| measure.name == name);
     at.map_or(0.0, |at| values[at])
 }
@@ -134,20 +256,21 @@ fn batch(seed: u64) -> Vec<Episode> {
 #[test]
 fn every_parameters_gradient_is_the_numeric_one() {
     // Half of the cases have every part.
-    for &case in CASES.iter().step_by(2) {
-        let networks = Networks::new(case);
+    each!(CASES.iter().step_by(2), |networks| {
+        let case = networks.case;
         let episodes = batch(7);
         let batch: Vec<&Episode> = episodes.iter().collect();
+        let draws = networks.draws(&batch);
         let pairing = |rows| draw_pairing(rows, &mut RunSeed(1).stream(Stream::Pairing, 0));
         let gradients = |seed| {
             let mut learner = networks.learner(2, 1, networks.params(seed));
             // The target stays where it is while the online parameters move.
             learner.target = gradcheck::noise(5, learner.target.len());
-            learner.gradients(&batch, &(), pairing);
+            learner.gradients(&batch, &draws, pairing);
             learner
         };
         // So small a layer's ReLUs may all be dead, which shows nothing.
-        let shows = |learner: &TdLearner<Recurrent>| {
+        let shows = |learner: &TdLearner<_>| {
             let layout = networks.model.layout();
             let live = |name: &str| !name.ends_with("attention.key.bias");
             let mut params = layout.params().iter().filter(|param| live(&param.name));
@@ -170,17 +293,21 @@ fn every_parameters_gradient_is_the_numeric_one() {
                 let (learner, moved) = &mut *cell.borrow_mut();
                 moved[range.clone()].copy_from_slice(values);
                 learner.params.copy_from_slice(moved);
-                let values = learner.gradients(&batch, &(), pairing);
+                let values = learner.gradients(&batch, &draws, pairing);
                 moved[range.clone()].copy_from_slice(&at[range.clone()]);
-                measure(learner, &values, "td_loss") + measure(learner, &values, "contrastive_loss")
+                whole_loss(learner, &values)
             });
         }
-    }
+    });
+}
+
+fn whole_loss<N: Drawn>(learner: &TdLearner<N>, values: &[f64]) -> f64 {
+    N::loss(|name| measure(learner, values, name))
 }
 
 /// Plays an episode's observations to a policy, step by step, and forces the recorded actions by making
 /// nothing else available.
-fn replay(acting: &mut ValueActing<Recurrent>, slots: &[(usize, &Episode)]) -> Vec<Vec<f32>> {
+fn replay<N: ValueNetwork>(acting: &mut ValueActing<N>, slots: &[(usize, &Episode)]) -> Vec<Vec<f32>> {
     let mut utilities = vec![vec![]; slots.len()];
     for &(slot, episode) in slots {
         acting.begin(slot, episode.n_agents);
@@ -234,7 +361,11 @@ fn replay(acting: &mut ValueActing<Recurrent>, slots: &[(usize, &Episode)]) -> V
 }
 
 /// What a learner's online network says of a batch, by (episode, time): utilities `[n, A]` and Q_total.
-fn said(learner: &mut TdLearner<Recurrent>, batch: &[&Episode]) -> HashMap<(usize, usize), (Vec<f32>, f32)> {
+fn said<N: Drawn>(
+    learner: &mut TdLearner<N>,
+    batch: &[&Episode],
+    draws: &N::Draws,
+) -> HashMap<(usize, usize), (Vec<f32>, f32)> {
     let said = Mutex::new(HashMap::new());
     let see = |seen: &SeenShard<'_>| {
         let values: HashMap<_, _> = seen.values().collect();
@@ -245,18 +376,20 @@ fn said(learner: &mut TdLearner<Recurrent>, batch: &[&Episode]) -> HashMap<(usiz
             ((seen.first_episode + step.episode, step.time), (utilities.collect(), q_total))
         }));
     };
-    learner.gradients_seen(batch, &(), |rows| (0..rows).collect(), see);
+    learner.gradients_seen(batch, draws, |rows| (0..rows).collect(), see);
     said.into_inner().unwrap()
 }
 
 #[test]
 fn acting_step_by_step_equals_the_parallel_pass() {
-    for case in CASES {
-        let networks = Networks::new(case);
+    each!(&CASES, |networks| {
+        let case = networks.case;
         let at = networks.params(3);
         let episodes = batch(11);
         let batch: Vec<&Episode> = episodes.iter().collect();
-        let trained = said(&mut networks.learner(1, 1, at.clone()), &batch);
+        let mut draws = networks.draws(&batch);
+        networks.quiet(&mut draws);
+        let trained = said(&mut networks.learner(1, 1, at.clone()), &batch, &draws);
         let slots: Vec<_> = batch.iter().copied().enumerate().collect();
         for ((index, episode), acted) in slots.iter().zip(replay(&mut networks.acting(&at), &slots)) {
             for time in 0..episode.steps() {
@@ -268,13 +401,13 @@ fn acting_step_by_step_equals_the_parallel_pass() {
                 }
             }
         }
-    }
+    });
 }
 
 #[test]
 fn acting_does_not_depend_on_company() {
-    for case in CASES {
-        let networks = Networks::new(case);
+    each!(&CASES, |networks| {
+        let case = networks.case;
         let at = networks.params(3);
         let episodes = batch(13);
         let together: Vec<_> = episodes.iter().enumerate().collect();
@@ -283,7 +416,7 @@ fn acting_does_not_depend_on_company() {
             let alone = replay(&mut networks.acting(&at), &[(3, episode)]);
             assert_eq!(alone[0], all[index], "{case:?} episode {index}, bit for bit");
         }
-    }
+    });
 }
 
 /// The same episode with its agents in another order: new row k is old row `order[k]`.
@@ -317,8 +450,8 @@ fn reordered(episode: &Episode, order: &[usize]) -> Episode {
 /// stay. Where they are made in order, the order shows.
 #[test]
 fn reordering_agents_reorders_utilities_and_no_more() {
-    for case in CASES {
-        let networks = Networks::new(case);
+    each!(&CASES, |networks| {
+        let case = networks.case;
         let mut learner = networks.learner(1, 1, networks.params(3));
         let episodes = batch(19);
         let orders: Vec<Vec<usize>> =
@@ -326,13 +459,19 @@ fn reordering_agents_reorders_utilities_and_no_more() {
         let others: Vec<Episode> =
             episodes.iter().zip(&orders).map(|(episode, order)| reordered(episode, order)).collect();
         let (batch, other) = (episodes.iter().collect::<Vec<_>>(), others.iter().collect::<Vec<_>>());
-        let loss = |learner: &mut TdLearner<Recurrent>, batch: &[&Episode]| {
-            let values = learner.gradients(batch, &(), |rows| (0..rows).collect());
-            measure(learner, &values, "td_loss")
-        };
-        let losses = [loss(&mut learner, &batch), loss(&mut learner, &other)];
-        let [ours, theirs] = [said(&mut learner, &batch), said(&mut learner, &other)];
-        let mut largest = (losses[0] - losses[1]).abs() as f32;
+        let draws = networks.draws(&batch);
+        let mut of_other = networks.draws(&batch);
+        networks.reorder(&mut of_other, &orders);
+        let losses = [(&batch, &draws), (&other, &of_other)].map(|(batch, draws)| {
+            let mut values = learner.gradients(batch, draws, |rows| (0..rows).collect());
+            // Of how task representations are paired, and not of agents' order.
+            let contrastive = learner.measures().iter().position(|it| it.name == "contrastive_loss");
+            contrastive.into_iter().for_each(|at| values[at] = 0.0);
+            values
+        });
+        let [ours, theirs] = [said(&mut learner, &batch, &draws), said(&mut learner, &other, &of_other)];
+        let differences = losses[0].iter().zip(&losses[1]).map(|(a, b)| (a - b).abs() / a.abs().max(1.0));
+        let mut largest = differences.fold(0.0, f64::max) as f32;
         for (&(episode, time), (utilities, q_total)) in
             ours.iter().filter(|((episode, time), _)| *time < episodes[*episode].steps())
         {
@@ -349,19 +488,20 @@ fn reordering_agents_reorders_utilities_and_no_more() {
         } else {
             assert!(largest < 1e-5, "{case:?}: {largest}");
         }
-    }
+    });
 }
 
 /// A batch need not fill every shard, nor fill them evenly.
 #[test]
 fn shards_without_episodes_add_nothing() {
-    for case in CASES {
-        let networks = Networks::new(case);
+    each!(&CASES, |networks| {
+        let case = networks.case;
         let episodes = batch(17);
         let batch: Vec<&Episode> = episodes.iter().collect();
         let grads = |shards| {
             let mut learner = networks.learner(shards, 2, networks.params(4));
-            let values = learner.gradients(&batch, &(), |rows| (0..rows).rev().collect());
+            let draws = networks.draws(&batch);
+            let values = learner.gradients(&batch, &draws, |rows| (0..rows).rev().collect());
             (values[0], learner.grads().to_vec())
         };
         let (loss, five) = grads(5);
@@ -373,20 +513,20 @@ fn shards_without_episodes_add_nothing() {
                 assert!((a - b).abs() < 1e-4 * b.abs().max(1.0), "{case:?}, {shards} shards: {a} {b}");
             }
         }
-    }
+    });
 }
 
 #[test]
 fn threads_change_no_bit() {
-    for case in CASES {
-        let networks = Networks::new(case);
+    each!(&CASES, |networks| {
+        let case = networks.case;
         let run = |threads| {
             let mut learner = networks.learner(3, threads, networks.params(3));
             for step in 0..5 {
                 let episodes = batch(step);
-                let draw = rit_algo::learner::Draw { seed: RunSeed(9), update: step };
+                let draw = Draw { seed: RunSeed(9), update: step };
                 let batch: Vec<&Episode> = episodes.iter().collect();
-                rit_algo::Learner::learn(&mut learner, &batch, draw).unwrap();
+                learner.learn(&batch, draw).unwrap();
                 learner.update_target();
             }
             learner.params
@@ -394,5 +534,5 @@ fn threads_change_no_bit() {
         let alone = run(1);
         assert_eq!(alone, run(2), "{case:?}");
         assert_eq!(alone, run(4), "{case:?}");
-    }
+    });
 }

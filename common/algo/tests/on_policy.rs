@@ -5,7 +5,7 @@
 use rand::RngExt as _;
 use rit_algo::{
     Learner, Mappo, MappoActing, MappoConfig, Mat, MatActing, MatConfig, Method, Model, ModelConfig,
-    PpoConfig, TerminalStates, UpdateConfig,
+    PpoConfig, RoleConfig, TerminalStates, UpdateConfig,
     flat::Slots,
     learner,
     learner::{Draw, NamedState},
@@ -375,6 +375,9 @@ fn under_training(method: Method) -> (Box<dyn Learner>, Vec<Episode>) {
         reward_embed_dim: 0,
         mixing_embed_dim: 0,
         hypernet_embed_dim: 0,
+        feedforward_dim: 0,
+        imagined_weight: 0.0,
+        role: RoleConfig::default(),
     });
     let (mappo, mat) = (mappo(SLOTS, A, 8), mat(SLOTS, A, 8));
     let (params, mut acting) = match method {

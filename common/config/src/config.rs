@@ -6,7 +6,9 @@ use crate::{
     method_keys::{self, by_name},
     number,
 };
-use rit_algo::{Method, ModelConfig, PpoConfig, Regime, TerminalStates, UpdateConfig, method::Encoder};
+use rit_algo::{
+    Method, ModelConfig, PpoConfig, Regime, RoleConfig, TerminalStates, UpdateConfig, method::Encoder,
+};
 use rit_env::{
     EnvironmentOptions, Split, Task, TaskSet,
     combat::{CombatOptions, StatsVersion, world::ScriptedMedivac},
@@ -354,6 +356,17 @@ impl Config {
             reward_embed_dim: network.reward_embed_dim,
             mixing_embed_dim: network.mixing_embed_dim,
             hypernet_embed_dim: network.hypernet_embed_dim,
+            feedforward_dim: network.feedforward_dim,
+            imagined_weight: self.algorithm.imagined_weight,
+            role: RoleConfig {
+                dim: network.role_dim,
+                hidden_dim: network.role_hidden_dim,
+                variance_floor: network.role_variance_floor,
+                entropy_weight: self.algorithm.role_entropy_weight,
+                kl_weight: self.algorithm.role_kl_weight,
+                dissimilarity_weight: self.algorithm.role_dissimilarity_weight,
+                soft_constraint: self.algorithm.role_soft_constraint,
+            },
         }
     }
 

@@ -209,6 +209,20 @@ mod tests {
     }
 
     #[test]
+    fn a_part_of_a_layer_makes_a_part_of_its_outputs() {
+        let mut layout = LayoutBuilder::default();
+        let layer = Linear::side_by_side(&mut layout, 3, &[("a", 2), ("b", 4)]);
+        let params = noise(1, layout.len());
+        let x = noise(2, 5 * 3);
+        let (mut all, mut some) = (vec![0.0; 5 * 6], vec![0.0; 5 * 3]);
+        layer.forward(&params, View::dense(&x, 3), ViewMut::dense(&mut all, 6));
+        layer.output_rows(1..4).forward(&params, View::dense(&x, 3), ViewMut::dense(&mut some, 3));
+        for row in 0..5 {
+            assert_eq!(some[row * 3..][..3], all[row * 6 + 1..][..3]);
+        }
+    }
+
+    #[test]
     fn gradients_are_the_numeric_ones() {
         let mut layout = LayoutBuilder::default();
         let linear = Linear::new(&mut layout, "l", 3, 4);

@@ -64,12 +64,14 @@ impl Encoder {
         queries
     }
 
-    /// Each agent's attention over the entities it is shown, (R, a).
-    pub fn within<'a>(&self, tape: &mut Tape<'a>, rows: &'a Rows, visible: Visible<'a>) -> Var {
+    /// Each agent's attention over the entities it is shown under M masks, (R M, a): row `r M + i` is agent row r's under
+    /// mask i.
+    pub fn within<'a>(&self, tape: &mut Tape<'a>, rows: &'a Rows, masks: &[Visible<'a>]) -> Var {
         let entities = self.entities(tape, rows);
         let queries = self.queries(tape, rows, entities);
         tape.free(entities.x);
-        let out = tape.attend(&self.attention, queries, entities.key_values, &rows.groups, visible);
+        let out = tape.reserve(queries.rows * masks.len(), self.attention_dim());
+        tape.attend_into(&self.attention, queries, entities.key_values, &rows.groups, masks, out);
         tape.free(queries);
         tape.free(entities.key_values);
         out
@@ -78,15 +80,30 @@ impl Encoder {
     /// [x_k ‖ each agent's attention over the entities it sees beside itself], (R, h + a): its own features are there
     /// already.
     pub fn beside<'a>(&self, tape: &mut Tape<'a>, rows: &'a Rows) -> Var {
+        self.beside_under(tape, rows, &rows.agent_entities, &[Visible::Where(&rows.others)])
+    }
+
+    /// The same under M masks, none of which shows an agent itself, rows as [`Encoder::within`] has them. `own` are the
+    /// entity rows of their agents, `[R M]`.
+    pub fn beside_under<'a>(
+        &self,
+        tape: &mut Tape<'a>,
+        rows: &'a Rows,
+        own: &'a [usize],
+        masks: &[Visible<'a>],
+    ) -> Var {
         let (h, a) = (self.hidden_dim(), self.attention_dim());
         let entities = self.entities(tape, rows);
-        let encoded = tape.reserve(rows.agent_rows(), h + a);
-        let (own, attended) = (encoded.columns(0..h), encoded.columns(h..h + a));
-        tape.gather_into(entities.x, &rows.agent_entities, own);
+        let encoded = tape.reserve(own.len(), h + a);
+        let (x, attended) = (encoded.columns(0..h), encoded.columns(h..h + a));
+        tape.gather_into(entities.x, own, x);
+        let queries = if masks.len() == 1 {
+            tape.linear(&self.attention.query, x)
+        } else {
+            self.queries(tape, rows, entities)
+        };
         tape.free(entities.x);
-        let queries = tape.linear(&self.attention.query, own);
-        let masks = [Visible::Where(&rows.others)];
-        tape.attend_into(&self.attention, queries, entities.key_values, &rows.groups, &masks, attended);
+        tape.attend_into(&self.attention, queries, entities.key_values, &rows.groups, masks, attended);
         tape.free(queries);
         tape.free(entities.key_values);
         encoded

@@ -24,6 +24,8 @@ pub struct Mixer {
     out: Linear,
     /// `w1_hidden`, `w2_hidden`, `b2_hidden` and `b1` side by side over c.
     hyper: Linear,
+    /// The first of these by itself.
+    w1_hidden: Linear,
     w1: Linear,
     w2: Linear,
     b2: Linear,
@@ -60,10 +62,11 @@ impl Mixer {
         let layers =
             [("mixer.w1_hidden", y), ("mixer.w2_hidden", y), ("mixer.b2_hidden", x), ("mixer.b1", x)];
         let hyper = Linear::side_by_side(layout, h + context, &layers);
+        let w1_hidden = hyper.output_rows(0..y);
         let w1 = Linear::new(layout, "mixer.w1", y, x);
         let w2 = Linear::new(layout, "mixer.w2", y, x);
         let b2 = Linear::new(layout, "mixer.b2", x, 1);
-        Self { encoder, out, hyper, w1, w2, b2 }
+        Self { encoder, out, hyper, w1_hidden, w1, w2, b2 }
     }
 
     /// All that does not depend on utilities: the weights that mix them, from `representation` (R, h_z) if there is
@@ -91,6 +94,24 @@ impl Mixer {
             tape.free(var);
         }
         MixerWeights { entities, queries, w1, b1: means.columns(y + x..y + 2 * x), w2, b2 }
+    }
+
+    /// The weights where agents are shown entities through M masks: W₁ of these, (R M, x), with row `r M + i` what agent
+    /// row r makes of mask i, and all else as it is. For utilities of imagined passes.
+    pub fn weights_under<'a>(
+        &self,
+        tape: &mut Tape<'a>,
+        rows: &'a Rows,
+        weights: &MixerWeights,
+        masks: &[Visible<'a>],
+    ) -> MixerWeights {
+        let MixerWeights { entities, queries, .. } = *weights;
+        let attended = tape.reserve(queries.rows * masks.len(), self.encoder.attention_dim());
+        let attention = &self.encoder.attention;
+        tape.attend_into(attention, queries, entities.key_values, &rows.groups, masks, attended);
+        let context = tape.linear(&self.out, attended);
+        let hidden = tape.linear_relu(&self.w1_hidden, context);
+        MixerWeights { w1: tape.linear(&self.w1, hidden), ..*weights }
     }
 
     /// Q_total (G, 1) from each agent's chosen utility `q` (R, 1).

@@ -98,7 +98,7 @@ impl<N: ValueNetwork> Policy for ValueActing<N> {
             before.utility.extend_from_slice(&memories[turn.slot].utility);
             before.task_encoder.extend_from_slice(&memories[turn.slot].task_encoder);
         }
-        let draws = network.draw_acting(turns);
+        let inputs = network.inputs(rows, &network.draw_acting(turns), 0);
         let mut tape = Tape::inference(params, mem::take(stock));
         let mut task_memory = None;
         let representation = parts.task.as_ref().map(|(task_encoder, _)| {
@@ -108,15 +108,7 @@ impl<N: ValueNetwork> Policy for ValueActing<N> {
             representation
         });
         let before = Some(tape.constant(View::dense(&before.utility, dims[0])));
-        let pass = Pass {
-            role: Role::Acting,
-            rows,
-            tables,
-            representation,
-            before,
-            draws: &draws,
-            first_episode: 0,
-        };
+        let pass = Pass { role: Role::Acting, rows, tables, representation, before, inputs: &inputs };
         let Utilities { memory, head, .. } = network.forward(&mut tape, pass);
         for (group, turn) in rows.groups.iter().zip(turns.iter()) {
             let states = |dim: usize| group.queries.start * dim..group.queries.end * dim;

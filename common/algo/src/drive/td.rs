@@ -28,7 +28,7 @@ use crate::{
 use rayon::{ThreadPool, ThreadPoolBuildError, prelude::*};
 use rit_episode::{Episode, Turn};
 use rit_nn::{Layout, Optimizer, Tape, Var, View, optimizer};
-use shard::{Represented, Shard, Update, Weights};
+use shard::{Represented, Shard, ShardInputs, Update, Weights};
 use std::{mem, ops::Range, sync::Arc};
 
 /// What the engine must know of every network that has utilities.
@@ -63,7 +63,7 @@ pub enum Role {
 
 /// What a pass is made over.
 #[derive(Clone, Copy, Debug)]
-pub struct Pass<'a, D> {
+pub struct Pass<'a, I> {
     /// Whose pass it is.
     pub role: Role,
     /// The rows.
@@ -74,10 +74,8 @@ pub struct Pass<'a, D> {
     pub representation: Option<Var>,
     /// What agents remember, (rows of the first time, memory), or zeros.
     pub before: Option<Var>,
-    /// What the update drew, for all episodes of the batch.
-    pub draws: &'a D,
-    /// The batch's index of the rows' episode 0.
-    pub first_episode: usize,
+    /// What the method reads beside the rows.
+    pub inputs: &'a I,
 }
 
 /// What a pass makes.
@@ -127,9 +125,11 @@ impl<'a> Head<'a> {
 }
 
 /// A shard's TD pass, as a method's own losses find it.
-pub struct TdPass<'a, 'p, E> {
+pub struct TdPass<'a, 'p, N: ValueNetwork> {
     /// Its rows.
     pub rows: &'a Rows,
+    /// What the method reads beside them.
+    pub inputs: &'a N::Inputs,
     /// What the whole batch's means divide by.
     pub totals: Totals,
     /// Targets y of each group; 0 where nothing was decided.
@@ -141,13 +141,18 @@ pub struct TdPass<'a, 'p, E> {
     /// Q of the online pass, (R, A).
     pub utilities: Var,
     /// What the online pass left.
-    pub extras: &'p E,
+    pub extras: &'p N::Extras,
 }
+
+/// What an independent implementation can be compared with: values by the names of golden data.
+pub type Said = Vec<(&'static str, Var)>;
 
 /// A network that values actions: a method that learns by temporal differences.
 pub trait ValueNetwork: Send + Sync + 'static {
     /// Random numbers of an update, beside the contrastive loss's pairing.
     type Draws: Send + Sync + Default;
+    /// What passes over some rows read beside them: what was drawn, as the rows lie.
+    type Inputs: Send + Sync + Default;
     /// What a pass leaves for the method's own losses.
     type Extras: Send;
     /// Whether the gradients of the method's own losses need sums over the whole batch.
@@ -175,12 +180,26 @@ pub trait ValueNetwork: Send + Sync + 'static {
         Self::Draws::default()
     }
 
-    /// One pass over rows.
-    fn forward<'a>(&self, tape: &mut Tape<'a>, pass: Pass<'a, Self::Draws>) -> Utilities<'a, Self::Extras>;
+    /// Lays out what was drawn. The rows' episode 0 is the `first_episode` of those that were drawn for.
+    fn inputs(&self, _rows: &Rows, _draws: &Self::Draws, _first_episode: usize) -> Self::Inputs {
+        Self::Inputs::default()
+    }
 
-    /// The sums over a shard that the method's own losses are made of. Seeds the tape, unless
-    /// [coupled](ValueNetwork::COUPLED). Shards without rows have no say: their sums are empty.
-    fn sums<'a>(&self, _tape: &mut Tape<'a>, _pass: &TdPass<'a, '_, Self::Extras>) -> Sums {
+    /// One pass over rows.
+    fn forward<'a>(&self, tape: &mut Tape<'a>, pass: Pass<'a, Self::Inputs>) -> Utilities<'a, Self::Extras>;
+
+    /// What the TD loss counts beside the method's own losses.
+    fn td_weight(&self) -> f32 {
+        1.0
+    }
+
+    /// The sums over a shard that the method's own losses are made of. Seeds the tape with the gradients of losses that
+    /// are not [coupled](ValueNetwork::COUPLED), and adds to what is `said`. Shards without rows have no say: their sums
+    /// are empty.
+    fn sums<'a>(&self, _tape: &mut Tape<'a>, _pass: &TdPass<'a, '_, Self>, _said: &mut Said) -> Sums
+    where
+        Self: Sized,
+    {
         Sums::new()
     }
 
@@ -190,12 +209,14 @@ pub trait ValueNetwork: Send + Sync + 'static {
     }
 
     /// Seeds a shard's tape with the gradients of coupled losses, `sums` being those over all shards.
-    fn seed(&self, _tape: &mut Tape<'_>, _extras: &Self::Extras, _sums: &[f64]) {}
-
-    /// What of the extras an independent implementation can be compared with: values by the names of golden data, a row
-    /// for each agent row or each group.
-    fn named(&self, _extras: &Self::Extras) -> Vec<(&'static str, Var)> {
-        Vec::new()
+    fn seed(
+        &self,
+        _tape: &mut Tape<'_>,
+        _rows: &Rows,
+        _totals: Totals,
+        _extras: &Self::Extras,
+        _sums: &[f64],
+    ) {
     }
 }
 
@@ -281,21 +302,25 @@ impl<N: ValueNetwork> TdLearner<N> {
         let tables = [network.tables(params), network.tables(target)];
         let online = Weights { params, tables: &tables[0] };
         let target = Weights { params: target, tables: &tables[1] };
-        let update = Update { network, online, target, draws, gamma: config.gamma, totals: totals(batch) };
+        let update = Update { network, online, target, gamma: config.gamma, totals: totals(batch) };
         let (sums, square) = pool.install(|| {
             rows.par_iter_mut().zip(&mut *shards).enumerate().for_each(|(index, (rows, shard))| {
                 rows.fill_from_episodes(&batch[part(batch.len(), count, index)], config.terminal_states);
                 shard.clear(online.params.len());
             });
+            let inputs = rows.par_iter().enumerate().map(|(index, rows)| {
+                let first_episode = part(batch.len(), count, index).start;
+                ShardInputs { first_episode, own: network.inputs(rows, draws, first_episode) }
+            });
+            let inputs: Vec<_> = inputs.collect();
             let mut represented = represent(&update, rows, shards, workers);
             if let Some((_, discriminator)) = &network.parts().task {
                 contrast(discriminator, online, rows, shards, &mut represented, pairs, workers, pairing);
             }
-            let first = |index: usize| part(batch.len(), count, index).start;
             let sums = if N::COUPLED {
-                update.run_coupled(rows, first, shards, &mut represented, workers, &see)
+                update.run_coupled(rows, &inputs, shards, &mut represented, workers, &see)
             } else {
-                update.run(rows, first, shards, &mut represented, workers, &see)
+                update.run(rows, &inputs, shards, &mut represented, workers, &see)
             };
             for (shard, represented) in shards.iter_mut().zip(represented) {
                 shard.stock =

@@ -72,6 +72,7 @@ impl Recurrent {
 
 impl ValueNetwork for Recurrent {
     type Draws = ();
+    type Inputs = ();
     type Extras = ();
 
     fn parts(&self) -> &ValueParts {
@@ -94,7 +95,7 @@ impl ValueNetwork for Recurrent {
         let encoded = if self.beside {
             self.encoder.beside(tape, rows)
         } else {
-            self.encoder.within(tape, rows, Visible::Where(&rows.observable))
+            self.encoder.within(tape, rows, &[Visible::Where(&rows.observable)])
         };
         let gates = tape.product_of(&self.gru.input, 0, &[encoded]);
         tape.free(encoded);

@@ -1,11 +1,11 @@
 //! Cases of methods that learn utilities by temporal differences.
 
-use super::{Cells, OptimizerConfig, Padding, Report, Tensors, compare_step, flat};
+use super::{Cells, OptimizerConfig, Padding, Report, Tensors, compare_step, flat, rivals};
 use rit_algo::{
-    Method, Model, ModelConfig, PpoConfig, TerminalStates, UpdateConfig,
+    Method, Model, ModelConfig, PpoConfig, RoleConfig, TerminalStates, UpdateConfig,
     drive::{SeenShard, TdLearner, ValueNetwork},
     method::Encoder,
-    methods::Recurrent,
+    methods::{Recurrent, Refil, Roma, Updet},
 };
 use rit_episode::Episode;
 use serde::Deserialize;
@@ -43,6 +43,12 @@ struct Sizes {
     mixing_embed_dim: usize,
     #[serde(default)]
     hypernet_embed_dim: usize,
+    #[serde(default)]
+    feedforward_dim: usize,
+    #[serde(default)]
+    imagined_weight: f32,
+    #[serde(flatten)]
+    role: Option<rivals::Role>,
 }
 
 /// Values of one state, by the names of golden data: numbers of every agent, or of the group.
@@ -73,9 +79,6 @@ pub fn compare(
 ) {
     let case: Case = serde_json::from_slice(&fs::read(folder.join("case.json")).unwrap()).unwrap();
     let (method, sizes) = (algorithm.parse::<Method>().unwrap(), &case.config);
-    if !method.facts().built {
-        return report.differences.push(format!("{}: {method} is not built yet", report.case));
-    }
     let config = ModelConfig {
         method,
         encoder: match sizes.encoder.as_deref() {
@@ -97,6 +100,9 @@ pub fn compare(
         reward_embed_dim: sizes.reward_embed_dim,
         mixing_embed_dim: sizes.mixing_embed_dim,
         hypernet_embed_dim: sizes.hypernet_embed_dim,
+        feedforward_dim: sizes.feedforward_dim,
+        imagined_weight: sizes.imagined_weight,
+        role: sizes.role.as_ref().map_or_else(RoleConfig::default, rivals::Role::config),
     };
     let (optimizer, lr) = case.optimizer.kind();
     let update = UpdateConfig {
@@ -133,7 +139,26 @@ pub fn compare(
             |losses| losses["td_loss"] + losses.get("contrastive_loss").unwrap_or(&0.0),
             report,
         ),
-        _ => panic!("{method} has no utilities here"),
+        Method::UpdetMix | Method::UpdetVdn => {
+            compared.run(Updet::new(&config), &(), |losses| losses["td_loss"], report);
+        }
+        Method::Refil => {
+            let weight = f64::from(config.imagined_weight);
+            let loss = |losses: &HashMap<&str, f64>| {
+                (1.0 - weight) * losses["td_loss"] + weight * losses["imagined_loss"]
+            };
+            let groups = rivals::groups(&compared.batch, &compared.cells);
+            compared.run(Refil::new(&config), &groups, loss, report);
+        }
+        Method::Roma => {
+            let weight = f64::from(config.role.dissimilarity_weight);
+            let loss = |losses: &HashMap<&str, f64>| {
+                losses["td_loss"] + losses["role_loss"] + weight * losses["dissimilarity_loss"]
+            };
+            let noise = rivals::noise(&compared.batch, &compared.cells, config.role.dim);
+            compared.run(Roma::new(&config), &noise, loss, report);
+        }
+        Method::Mappo | Method::Mat => panic!("{method} has no utilities"),
     }
 }
 
@@ -222,7 +247,12 @@ impl Compared<'_> {
                     };
                     let cell = episode * shape[1] + time;
                     ours.extend_from_slice(&values.numbers);
-                    if values.per_agent {
+                    if rivals::of_pairs(&name) {
+                        for &row in &cells.agents[episode] {
+                            let row = &theirs[(cell * agents_max + row) * agents_max..][..agents_max];
+                            reference.extend(cells.agents[episode].iter().map(|&other| row[other]));
+                        }
+                    } else if values.per_agent {
                         let width: usize = shape[3..].iter().product();
                         for &row in &cells.agents[episode] {
                             reference
@@ -242,12 +272,19 @@ impl Compared<'_> {
 fn states(seen: &SeenShard<'_>) -> Vec<((usize, usize), Said)> {
     let rows = seen.rows;
     let groups = rows.steps.iter().zip(&rows.groups).enumerate();
+    // Ordered pairs of agents in steps that were taken.
+    let mut pairs = 0..0;
     let states = groups.map(|(group, (step, members))| {
         let members = members.queries.clone();
+        pairs = pairs.end..pairs.end + if step.filled { members.len() * members.len() } else { 0 };
         let mut said = Said::new();
         for (name, view) in seen.values() {
             let per_agent = view.rows == rows.agent_rows() && view.cols > 0 && name != "q_total";
-            let of_state = if per_agent { members.clone() } else { group..group + 1 };
+            let of_state = match per_agent {
+                _ if rivals::of_pairs(name) => pairs.clone(),
+                true => members.clone(),
+                false => group..group + 1,
+            };
             let numbers = of_state.flat_map(|row| view.row(row).to_vec()).collect();
             said.insert(name, Values { per_agent, numbers });
         }

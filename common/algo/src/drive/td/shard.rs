@@ -1,6 +1,6 @@
 //! A part of the batch: forward through both networks, and backward.
 
-use super::{Pass, Role, TdPass, Utilities, ValueNetwork};
+use super::{Pass, Role, Said, TdPass, Utilities, ValueNetwork};
 use crate::{
     Rows,
     blocks::{MixerWeights, TaskEncoder, decoder::Tables},
@@ -101,12 +101,19 @@ impl<'a> Represented<'a> {
     }
 }
 
+/// What a shard's passes read beside its rows.
+pub(super) struct ShardInputs<I> {
+    /// The batch's index of the rows' episode 0.
+    pub(super) first_episode: usize,
+    /// The method's own.
+    pub(super) own: I,
+}
+
 /// What all shards of an update share.
 pub(super) struct Update<'a, N: ValueNetwork> {
     pub(super) network: &'a N,
     pub(super) online: Weights<'a>,
     pub(super) target: Weights<'a>,
-    pub(super) draws: &'a N::Draws,
     pub(super) gamma: f32,
     pub(super) totals: Totals,
 }
@@ -130,14 +137,14 @@ impl<N: ValueNetwork> Update<'_, N> {
     pub(super) fn run(
         &self,
         rows: &[Rows],
-        first: impl Fn(usize) -> usize + Sync,
+        inputs: &[ShardInputs<N::Inputs>],
         shards: &mut [Shard],
         represented: &mut [Option<Represented<'_>>],
         workers: &Workers,
         see: &(impl Fn(&SeenShard<'_>) + Sync),
     ) -> ShardSums {
-        rows.par_iter().zip(&mut *shards).zip(represented).enumerate().for_each(
-            |(index, ((rows, shard), represented))| {
+        rows.par_iter().zip(inputs).zip(&mut *shards).zip(represented).for_each(
+            |(((rows, inputs), shard), represented)| {
                 if rows.groups.is_empty() {
                     return;
                 }
@@ -145,7 +152,7 @@ impl<N: ValueNetwork> Update<'_, N> {
                     let Shard { grads, sums, .. } = shard;
                     let of_online = mem::take(&mut worker.online);
                     let (z, target) = (represented.as_ref(), &mut worker.target);
-                    let online = self.forward(rows, first(index), z, sums, of_online, target, see);
+                    let online = self.forward(rows, inputs, z, sums, of_online, target, see);
                     let (d, stock) = online.backward(grads);
                     worker.online = stock;
                     if let Some(represented) = represented {
@@ -161,27 +168,27 @@ impl<N: ValueNetwork> Update<'_, N> {
     pub(super) fn run_coupled(
         &self,
         rows: &[Rows],
-        first: impl Fn(usize) -> usize + Sync,
+        inputs: &[ShardInputs<N::Inputs>],
         shards: &mut [Shard],
         represented: &mut [Option<Represented<'_>>],
         workers: &Workers,
         see: &(impl Fn(&SeenShard<'_>) + Sync),
     ) -> ShardSums {
-        let passes = rows.par_iter().zip(&mut *shards).zip(&*represented).enumerate();
-        let passes = passes.map(|(index, ((rows, shard), represented))| {
+        let passes = rows.par_iter().zip(inputs).zip(&mut *shards).zip(&*represented);
+        let passes = passes.map(|(((rows, inputs), shard), represented)| {
             (!rows.groups.is_empty()).then(|| {
                 let Shard { sums, online, .. } = shard;
                 workers.with(|worker| {
                     let (stock, target) = (mem::take(online), &mut worker.target);
-                    self.forward(rows, first(index), represented.as_ref(), sums, stock, target, see)
+                    self.forward(rows, inputs, represented.as_ref(), sums, stock, target, see)
                 })
             })
         });
         let passes: Vec<_> = passes.collect();
         let sums = total(shards);
-        let gradients = passes.into_par_iter().zip(&mut *shards).map(|(pass, shard)| {
+        let gradients = passes.into_par_iter().zip(rows).zip(&mut *shards).map(|((pass, rows), shard)| {
             let mut pass = pass?;
-            self.network.seed(&mut pass.tape, &pass.extras, &sums.own);
+            self.network.seed(&mut pass.tape, rows, self.totals, &pass.extras, &sums.own);
             let (d, stock) = pass.backward(&mut shard.grads);
             shard.online = stock;
             d
@@ -201,7 +208,7 @@ impl<N: ValueNetwork> Update<'_, N> {
     fn forward<'p>(
         &'p self,
         rows: &'p Rows,
-        first_episode: usize,
+        inputs: &'p ShardInputs<N::Inputs>,
         represented: Option<&'p Represented<'_>>,
         sums: &mut ShardSums,
         stock: Stock,
@@ -216,13 +223,13 @@ impl<N: ValueNetwork> Update<'_, N> {
             target.free(history);
             representation
         });
-        let prepared = self.prepare(&mut target, self.target, Role::Target, rows, first_episode, of_target);
+        let prepared = self.prepare(&mut target, self.target, Role::Target, rows, inputs, of_target);
 
         let mut tape = Tape::recording(self.online.params, stock);
         let representation =
             represented.map(|represented| tape.input(represented.tape.view(represented.representation)));
         let Prepared { utilities: Utilities { memory, mut head, extras }, mixing } =
-            self.prepare(&mut tape, self.online, Role::Online, rows, first_episode, representation);
+            self.prepare(&mut tape, self.online, Role::Online, rows, inputs, representation);
         let greedy = head.greedy(&tape, rows, parts.n_actions);
         // The greedy pass's utilities make room for those of the actions taken, which backward needs.
         let utilities = head.utilities(&mut tape, rows, &rows.actions);
@@ -235,6 +242,7 @@ impl<N: ValueNetwork> Update<'_, N> {
         tape.seed(q_total, View::dense(&d_total, 1));
         let pass = TdPass {
             rows,
+            inputs: &inputs.own,
             totals: self.totals,
             td_targets: &td_targets,
             mixing,
@@ -242,16 +250,14 @@ impl<N: ValueNetwork> Update<'_, N> {
             utilities,
             extras: &extras,
         };
-        sums.own = self.network.sums(&mut tape, &pass);
+        let mut said = vec![("history", memory), ("utilities", utilities), ("q_total", q_total)];
+        said.extend(representation.map(|representation| ("task_representation", representation)));
+        sums.own = self.network.sums(&mut tape, &pass, &mut said);
         see(&SeenShard {
             rows,
-            first_episode,
+            first_episode: inputs.first_episode,
             tape: &tape,
-            named: [("history", memory), ("utilities", utilities), ("q_total", q_total)]
-                .into_iter()
-                .chain(representation.map(|representation| ("task_representation", representation)))
-                .chain(self.network.named(&extras))
-                .collect(),
+            said,
             greedy_actions: &greedy,
             target_q_total: target.slice(target_q_total),
             td_targets: &td_targets,
@@ -267,11 +273,11 @@ impl<N: ValueNetwork> Update<'_, N> {
         weights: Weights<'p>,
         role: Role,
         rows: &'p Rows,
-        first_episode: usize,
+        inputs: &'p ShardInputs<N::Inputs>,
         representation: Option<Var>,
     ) -> Prepared<'p, N::Extras> {
-        let (tables, draws) = (weights.tables, self.draws);
-        let pass = Pass { role, rows, tables, representation, before: None, draws, first_episode };
+        let (tables, inputs) = (weights.tables, &inputs.own);
+        let pass = Pass { role, rows, tables, representation, before: None, inputs };
         let utilities = self.network.forward(tape, pass);
         let mixer = self.network.parts().mixer.as_ref();
         Prepared { utilities, mixing: mixer.map(|mixer| mixer.weights(tape, rows, representation)) }
@@ -306,7 +312,7 @@ impl<N: ValueNetwork> Update<'_, N> {
             *losses += loss;
             *q_totals += f64::from(q_total[group]);
             *targets += f64::from(target);
-            (td_targets[group], d_total[group]) = (target, d);
+            (td_targets[group], d_total[group]) = (target, self.network.td_weight() * d);
         }
         Targets { td_targets, d_total }
     }
@@ -353,7 +359,7 @@ pub struct SeenShard<'s> {
     /// The batch's index of their episode 0.
     pub first_episode: usize,
     tape: &'s Tape<'s>,
-    named: Vec<(&'static str, Var)>,
+    said: Said,
     /// The online network's greedy joint action of each agent row.
     pub greedy_actions: &'s [u8],
     /// The target network's Q_total of these, of each group.
@@ -365,6 +371,6 @@ pub struct SeenShard<'s> {
 impl SeenShard<'_> {
     /// What the online network made, by name: a row for each agent row, or for each group.
     pub fn values(&self) -> impl Iterator<Item = (&'static str, View<'_>)> {
-        self.named.iter().map(|&(name, var)| (name, self.tape.view(var)))
+        self.said.iter().map(|&(name, var)| (name, self.tape.view(var)))
     }
 }
