@@ -171,8 +171,14 @@ impl ActorCritic for Mat {
         let values = self.value.forward(tape, encoded);
         let tokens = self.embed_tokens(tape, &inputs.one_hots);
         let mut x = tape.gather(tokens, &inputs.tokens);
-        for block in &self.decoder {
-            x = block.forward(tape, x, encoded, &inputs.teams, Visible::Where(&inputs.before));
+        for (index, block) in self.decoder.iter().enumerate() {
+            let projected = match index {
+                // There are few tokens and many rows.
+                0 => block.self_attention.project(tape, tokens, tokens).gather(tape, &inputs.tokens),
+                _ => block.self_attention.project(tape, x, x),
+            };
+            let before = Visible::Where(&inputs.before);
+            x = block.forward(tape, x, projected, encoded, &inputs.teams, before);
         }
         Outputs { logits: self.head.forward(tape, x), values }
     }
@@ -218,22 +224,42 @@ impl MultiHead {
         })
     }
 
-    fn forward<'a>(
+    /// Queries of some rows; keys and values of some, maybe others.
+    fn project(&self, tape: &mut Tape<'_>, queries: Var, keys: Var) -> Projected {
+        Projected {
+            queries: tape.linear(&self.attention.query, queries),
+            key_values: tape.key_values(&self.attention, keys),
+        }
+    }
+
+    /// What the queries see of the keys of their groups.
+    fn attend<'a>(
         &self,
         tape: &mut Tape<'a>,
-        queries: Var,
-        keys: Var,
+        Projected { queries, key_values }: Projected,
         groups: &'a [Group],
         visible: Visible<'a>,
     ) -> Var {
-        let queries = tape.linear(&self.attention.query, queries);
-        let key_values = tape.key_values(&self.attention, keys);
         let out = tape.attend(&self.attention, queries, key_values, groups, visible);
         tape.free(queries);
-        tape.free(key_values);
         let y = tape.linear(&self.proj, out);
         tape.free(out);
         y
+    }
+}
+
+/// (Q, e) and (K, 2e).
+#[derive(Clone, Copy)]
+struct Projected {
+    queries: Var,
+    key_values: Var,
+}
+
+impl Projected {
+    /// These rows of both.
+    fn gather<'a>(self, tape: &mut Tape<'a>, rows: &'a [usize]) -> Self {
+        let Self { queries, key_values } = self;
+        Self { queries: tape.gather(queries, rows), key_values: tape.gather(key_values, rows) }
     }
 }
 
@@ -305,7 +331,9 @@ impl EncoderBlock {
     }
 
     fn forward<'a>(&self, tape: &mut Tape<'a>, x: Var, teams: &'a [Group]) -> Var {
-        let attended = self.attention.forward(tape, x, x, teams, Visible::All);
+        let projected = self.attention.project(tape, x, x);
+        let attended = self.attention.attend(tape, projected, teams, Visible::All);
+        tape.free(projected.key_values);
         let y = normalized_sum(tape, &self.norm1, x, attended);
         tape.free(x);
         let hidden = self.mlp.forward(tape, y);
@@ -338,20 +366,26 @@ impl DecoderBlock {
         }
     }
 
+    /// `projected` is [`MultiHead::project`] of the self-attention over `x`.
     fn forward<'a>(
         &self,
         tape: &mut Tape<'a>,
         x: Var,
+        projected: Projected,
         encoded: Var,
         teams: &'a [Group],
         before: Visible<'a>,
     ) -> Var {
-        let attended = self.self_attention.forward(tape, x, x, teams, before);
+        let attended = self.self_attention.attend(tape, projected, teams, before);
         let y = normalized_sum(tape, &self.norm1, x, attended);
-        tape.free(x);
-        let attended = self.cross_attention.forward(tape, encoded, y, teams, before);
-        tape.free(y);
-        let y = normalized_sum(tape, &self.norm2, encoded, attended);
+        let projected = self.cross_attention.project(tape, encoded, y);
+        let attended = self.cross_attention.attend(tape, projected, teams, before);
+        self.finish(tape, encoded, attended)
+    }
+
+    /// What comes behind both attentions; `own` is what the encoder made of the rows.
+    fn finish(&self, tape: &mut Tape<'_>, own: Var, attended: Var) -> Var {
+        let y = normalized_sum(tape, &self.norm2, own, attended);
         let hidden = self.mlp.forward(tape, y);
         let z = normalized_sum(tape, &self.norm3, y, hidden);
         tape.free(y);

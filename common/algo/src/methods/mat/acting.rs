@@ -3,7 +3,7 @@
 //! All that does not depend on actions is made at once. Then come the agents: the first of every episode together, then
 //! the second, and so on, each given its own token and the keys and values of those before it.
 
-use super::{DecoderBlock, Mat, MultiHead, normalized_sum};
+use super::{DecoderBlock, Mat, MultiHead, Projected, normalized_sum};
 use crate::{
     Rows,
     methods::Actor,
@@ -22,20 +22,20 @@ pub struct MatActing {
     mat: Arc<Mat>,
     params: Vec<f32>,
     inputs: Inputs,
-    places: Places,
+    places: Vec<Place>,
     stock: Stock,
     logits: Vec<f32>,
 }
 
-/// Which rows choose together, and where their keys and values lie.
+/// A place in the decision order: the agents there choose together.
 #[derive(Default)]
-struct Places {
-    /// Of each place in the decision order: the turns that have an agent there.
-    turns: Vec<Vec<usize>>,
+struct Place {
+    /// The turns that have an agent there.
+    turns: Vec<usize>,
     /// These agents' rows.
-    rows: Vec<Vec<usize>>,
+    rows: Vec<usize>,
     /// Each of these alone, over the rows of its team up to its own.
-    groups: Vec<Vec<Group>>,
+    groups: Vec<Group>,
 }
 
 impl MatActing {
@@ -48,7 +48,7 @@ impl MatActing {
             mat,
             params: Vec::new(),
             inputs: Inputs::default(),
-            places: Places::default(),
+            places: Vec::new(),
             stock: Stock::default(),
             logits: Vec::new(),
         };
@@ -78,7 +78,7 @@ impl Policy for MatActing {
         let Self { mat, params, inputs, places, stock, logits } = self;
         inputs.rows.fill_from_turns(turns);
         mat.fill(inputs);
-        places.fill(&inputs.rows);
+        *places = Place::all(&inputs.rows);
         let n_actions = mat.config.n_actions;
         logits.clear();
         logits.resize(inputs.rows.agent_rows() * n_actions, 0.0);
@@ -86,28 +86,19 @@ impl Policy for MatActing {
         let mut tape = Tape::inference(params, std::mem::take(stock));
         let observations = tape.constant(View::dense(&inputs.observations, mat.config.slots.width()));
         let encoded = mat.encode(&mut tape, observations, &inputs.teams);
-        let tokens = mat.embed_tokens(&mut tape, &inputs.one_hots);
-        let caches: Vec<Cache> =
-            mat.decoder.iter().map(|block| Cache::of(block, &mut tape, encoded.rows)).collect();
-        for place in 0..places.rows.len() {
-            let rows = &places.rows[place];
-            let of_place = places.turns[place].iter().map(|&turn| match place {
+        let decoding = Decoding::new(mat, &mut tape, encoded, &inputs.one_hots);
+        for (index, place) in places.iter().enumerate() {
+            let token = |&turn: &usize| match index {
                 0 => 0,
-                _ => usize::from(turns[turn].actions[place - 1]) + 1,
-            });
-            let mut x = pick(&mut tape, tokens, &of_place.collect::<Vec<_>>());
-            let own = pick(&mut tape, encoded, rows);
-            for (block, cache) in mat.decoder.iter().zip(&caches) {
-                x = cache.forward(block, &mut tape, x, own, rows, &places.groups[place]);
-            }
-            let of_rows = mat.head.forward(&mut tape, x);
-            tape.free(x);
-            tape.free(own);
-            for (at, (&row, &turn)) in rows.iter().zip(&places.turns[place]).enumerate() {
+                _ => usize::from(turns[turn].actions[index - 1]) + 1,
+            };
+            let tokens: Vec<usize> = place.turns.iter().map(token).collect();
+            let of_rows = decoding.decide(&mut tape, place, &tokens);
+            for (at, (&row, &turn)) in place.rows.iter().zip(&place.turns).enumerate() {
                 let of_row = row * n_actions..(row + 1) * n_actions;
                 logits[of_row.clone()].copy_from_slice(tape.view(of_rows).row(at));
                 let (turn, available) = (&mut turns[turn], &inputs.rows.available[of_row.clone()]);
-                turn.actions[place] = on_policy::choose(&logits[of_row], available, turn.exploration);
+                turn.actions[index] = on_policy::choose(&logits[of_row], available, turn.exploration);
             }
             tape.free(of_rows);
         }
@@ -115,25 +106,59 @@ impl Policy for MatActing {
     }
 }
 
-impl Places {
-    fn fill(&mut self, rows: &Rows) {
+impl Place {
+    fn all(rows: &Rows) -> Vec<Self> {
         let longest = rows.groups.iter().map(|group| group.queries.len()).max().unwrap_or(0);
-        let having = |place: usize| {
-            let all = rows.groups.iter().enumerate();
-            all.filter(move |(_, group)| group.queries.len() > place)
-        };
-        let row = |group: &Group, place| group.queries.start + place;
-        self.turns = (0..longest).map(|place| having(place).map(|(turn, _)| turn).collect()).collect();
-        self.rows =
-            (0..longest).map(|place| having(place).map(|(_, group)| row(group, place)).collect()).collect();
-        let group = |place: usize| {
-            let each = having(place).enumerate();
-            each.map(move |(at, (_, group))| Group {
-                queries: at..at + 1,
-                keys: group.queries.start..row(group, place) + 1,
-            })
-        };
-        self.groups = (0..longest).map(|place| group(place).collect()).collect();
+        let mut all: Vec<Self> = (0..longest).map(|_| Self::default()).collect();
+        for (turn, group) in rows.groups.iter().enumerate() {
+            for (place, row) in all.iter_mut().zip(group.queries.clone()) {
+                let at = place.rows.len();
+                place.turns.push(turn);
+                place.rows.push(row);
+                place.groups.push(Group { queries: at..at + 1, keys: group.queries.start..row + 1 });
+            }
+        }
+        all
+    }
+}
+
+/// What the decoder makes before the first action, and what it keeps from one place to the next.
+struct Decoding<'m> {
+    mat: &'m Mat,
+    encoded: Var,
+    /// The tokens' embeddings, (A + 1, e).
+    tokens: Var,
+    /// Their projections by the first block.
+    of_tokens: Option<Projected>,
+    /// Of each block.
+    caches: Vec<Cache>,
+}
+
+impl<'m> Decoding<'m> {
+    fn new<'a>(mat: &'m Mat, tape: &mut Tape<'a>, encoded: Var, one_hots: &'a [f32]) -> Self {
+        let tokens = mat.embed_tokens(tape, one_hots);
+        let of_tokens = mat.decoder.first().map(|block| block.self_attention.project(tape, tokens, tokens));
+        let caches = mat.decoder.iter().map(|block| Cache::of(block, tape, encoded.rows)).collect();
+        Self { mat, encoded, tokens, of_tokens, caches }
+    }
+
+    /// Logits of one place's rows, given their tokens.
+    fn decide<'a>(&self, tape: &mut Tape<'a>, place: &'a Place, tokens: &[usize]) -> Var {
+        let mut x = pick(tape, self.tokens, tokens);
+        let own = pick(tape, self.encoded, &place.rows);
+        let mut of_tokens = self.of_tokens.map(|Projected { queries, key_values }| Projected {
+            queries: pick(tape, queries, tokens),
+            key_values: pick(tape, key_values, tokens),
+        });
+        for (block, cache) in self.mat.decoder.iter().zip(&self.caches) {
+            let of_tokens = of_tokens.take();
+            let projected = of_tokens.unwrap_or_else(|| block.self_attention.project(tape, x, x));
+            x = cache.forward(block, tape, x, projected, own, place);
+        }
+        let logits = self.mat.head.forward(tape, x);
+        tape.free(x);
+        tape.free(own);
+        logits
     }
 }
 
@@ -149,26 +174,23 @@ impl Cache {
         Self { itself: reserve(&block.self_attention), cross: reserve(&block.cross_attention) }
     }
 
-    /// The block over one place's rows: `x` and what the encoder made of them, `own`.
+    /// The block over one place's rows: `x`, its projections, and what the encoder made of the rows, `own`.
     fn forward<'a>(
         &self,
         block: &DecoderBlock,
         tape: &mut Tape<'a>,
         x: Var,
+        projected: Projected,
         own: Var,
-        rows: &[usize],
-        groups: &'a [Group],
+        place: &'a Place,
     ) -> Var {
-        let attended = attend(&block.self_attention, tape, x, x, self.itself, rows, groups);
+        let attended = attend(&block.self_attention, tape, projected, self.itself, place);
         let y = normalized_sum(tape, &block.norm1, x, attended);
         tape.free(x);
-        let attended = attend(&block.cross_attention, tape, own, y, self.cross, rows, groups);
+        let projected = block.cross_attention.project(tape, own, y);
         tape.free(y);
-        let y = normalized_sum(tape, &block.norm2, own, attended);
-        let hidden = block.mlp.forward(tape, y);
-        let z = normalized_sum(tape, &block.norm3, y, hidden);
-        tape.free(y);
-        z
+        let attended = attend(&block.cross_attention, tape, projected, self.cross, place);
+        block.finish(tape, own, attended)
     }
 }
 
@@ -176,25 +198,18 @@ impl Cache {
 fn attend<'a>(
     layer: &MultiHead,
     tape: &mut Tape<'a>,
-    queries: Var,
-    keys: Var,
+    projected: Projected,
     cache: Var,
-    rows: &[usize],
-    groups: &'a [Group],
+    place: &'a Place,
 ) -> Var {
-    let new = tape.key_values(&layer.attention, keys);
+    let new = projected.key_values;
     tape.write_into(cache, |values, mut cache, _| {
-        for (at, &row) in rows.iter().enumerate() {
+        for (at, &row) in place.rows.iter().enumerate() {
             cache.row(row).copy_from_slice(values.view(new).row(at));
         }
     });
     tape.free(new);
-    let queries = tape.linear(&layer.attention.query, queries);
-    let out = tape.attend(&layer.attention, queries, cache, groups, Visible::All);
-    tape.free(queries);
-    let y = tape.linear(&layer.proj, out);
-    tape.free(out);
-    y
+    layer.attend(tape, Projected { key_values: cache, ..projected }, &place.groups, Visible::All)
 }
 
 /// y row i = x row `rows[i]`, without a gradient.
