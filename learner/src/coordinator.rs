@@ -1,77 +1,43 @@
 //! Between actors, trainer and callers: hands out leases, takes episodes in, answers for the run's state.
 //!
-//! One task owns the ledger and the list of actors; everybody else sends it [`Event`]s. It never waits for
-//! the trainer or for an actor, so a slow one holds up nobody.
+//! A state machine that owns the ledger and the list of actors: it is told what happened and at what time, and answers
+//! with what is to be done. Channels, clocks and connections are its [`Shell`]'s, which everybody else sends
+//! [`Event`]s. It never waits for the trainer or for an actor, so a slow one holds up nobody. `rit soak --simulated`
+//! drives this very code.
 
 mod control;
+mod joining;
+mod messages;
+mod shell;
+mod standstill;
 mod status;
 
 use crate::{
     evaluation::in_words,
     gauges::{Happenings, RateWindow, Stopwatch},
-    ledger::{ActorId, Lease, Ledger, Reason, Terms},
+    ledger::{ActorId, Counts, Lease, Ledger, Reason},
     receive::Fence,
-    trainer::{Beginning, News, Standing, Work},
+    trainer::{Beginning, News, Standing},
     writer::CheckpointEnded,
 };
 use rit_algo::learner::Measure;
 use rit_config::Config;
-use rit_episode::{Episode, wire};
-use rit_proto::v1::{self, LearnerMessage, learner_message::Message};
-use std::{
-    collections::BTreeMap,
-    sync::mpsc,
-    time::{Duration, Instant},
-};
-use tokio::sync::{mpsc as async_mpsc, oneshot};
-use tonic::Status;
+use rit_episode::Episode;
+use rit_proto::v1;
+use std::{collections::BTreeMap, time::Duration};
 
-pub use control::Control;
+pub use messages::{Effect, Input, Joining, Refusal};
+pub use shell::{ACTOR_QUEUE, Control, Event, Shell};
+pub use standstill::STANDSTILL_AFTER;
 
 /// How long the end of a run waits for actors to go.
 const FAREWELL_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// From one look for hung actors, at rates and at the ledger's balance to the next.
-const LOOK_EVERY: Duration = Duration::from_millis(250);
+pub const LOOK_EVERY: Duration = Duration::from_millis(250);
 
-/// Messages an actor's stream may hold: far more than one lease at a time can fill.
-pub const ACTOR_QUEUE: usize = 64;
-
-/// What happens to a run.
-#[derive(Debug)]
-pub enum Event {
-    /// An episode was read and found valid.
-    Episode(ActorId, Box<Episode>),
-    /// A frame was refused.
-    FrameRefused(&'static str),
-    /// An actor wants to join.
-    Join(
-        v1::Hello,
-        async_mpsc::Sender<Result<LearnerMessage, Status>>,
-        oneshot::Sender<Result<ActorId, Status>>,
-    ),
-    /// An actor has sent all of this lease.
-    Done(ActorId, u64),
-    /// All that an actor had sent by `Done` has been read.
-    Fenced(Fence),
-    /// An actor is there.
-    Heartbeat(ActorId),
-    /// An actor wants to go.
-    Leaving(ActorId),
-    /// An actor's stream has ended.
-    Gone(ActorId),
-    /// Shared memory is elsewhere from now on, with what somebody should know of the new place: whoever sends there has
-    /// to join again.
-    PlaceLost(Option<String>),
-    /// The trainer speaks.
-    News(News),
-    /// The writer is done with a checkpoint.
-    CheckpointEnded(CheckpointEnded),
-    /// The trainer or the receiving thread is done, well or not: nothing more can happen.
-    Over,
-    /// Somebody asks or wants something.
-    Control(Control),
-}
+/// A look that comes so much later finds that this process itself stood still.
+const LATE_LOOK: Duration = Duration::from_secs(1);
 
 /// An actor that is there.
 #[derive(Debug)]
@@ -84,14 +50,13 @@ struct Actor {
     slot: Option<u32>,
     /// On another host.
     remote: bool,
-    to: async_mpsc::Sender<Result<LearnerMessage, Status>>,
     /// Episodes inserted.
     episodes: u64,
     /// Leases it was given; the last one's number.
     leases: u64,
     leaving: bool,
     /// When it last said anything.
-    heard: Instant,
+    heard: Duration,
     /// Silent for too long: its episodes went to another.
     hung: bool,
     /// Runs while the ledger hands nothing out to it.
@@ -106,10 +71,19 @@ impl Actor {
 }
 
 /// The coordinator.
+#[derive(Debug)]
 pub struct Coordinator {
     config: Config,
-    /// What every actor is told when it joins, but for its own number.
-    welcome: v1::Welcome,
+    /// When the last event came, since this learner began.
+    now: Duration,
+    /// When the last look was.
+    looked: Duration,
+    /// When something went on last.
+    moved_at: Duration,
+    /// Why nothing goes on, once that was said.
+    stands_still: Option<String>,
+    /// When the trainer was done.
+    over_since: Option<Duration>,
     ledger: Ledger,
     actors: BTreeMap<ActorId, Actor>,
     next_actor: ActorId,
@@ -134,24 +108,15 @@ pub struct Coordinator {
     happenings: Happenings,
     /// How often the ledger was found not to balance.
     imbalances: u64,
-    started: Instant,
-    work: mpsc::Sender<Work>,
-    fences: mpsc::Sender<Fence>,
 }
 
 impl Coordinator {
-    /// A coordinator where a run begins. Actors are told `welcome`; `work` leads to the trainer, `fences` to the receiving thread.
-    pub fn new(
-        config: Config,
-        welcome: v1::Welcome,
-        beginning: Beginning,
-        work: mpsc::Sender<Work>,
-        fences: mpsc::Sender<Fence>,
-    ) -> Self {
+    /// A coordinator where a run begins.
+    pub fn new(config: Config, beginning: Beginning) -> Self {
         let Beginning { batches, terms, standing, measures, warnings } = beginning;
-        let started = Instant::now();
-        let mut happenings = Happenings::new(started);
-        warnings.into_iter().for_each(|what| happenings.warn(standing.progress.env_steps, what));
+        let mut happenings = Happenings::default();
+        let steps = standing.progress.env_steps;
+        warnings.into_iter().for_each(|what| happenings.warn(Duration::ZERO, steps, what));
         Self {
             epsilon: config.epsilon(standing.progress.env_steps),
             standing,
@@ -170,45 +135,60 @@ impl Coordinator {
             checkpoints_fail: false,
             happenings,
             imbalances: 0,
-            started,
+            now: Duration::ZERO,
+            looked: Duration::ZERO,
+            moved_at: Duration::ZERO,
+            stands_still: None,
+            over_since: None,
             config,
-            welcome,
-            work,
-            fences,
         }
     }
 
-    /// Works until the trainer is done and the actors have gone.
-    pub async fn run(mut self, mut events: async_mpsc::Receiver<Event>) {
-        let mut looks = tokio::time::interval(LOOK_EVERY);
-        loop {
-            tokio::select! {
-                event = events.recv() => match event {
-                    None | Some(Event::Over) => break,
-                    Some(event) => self.handle(event),
-                },
-                _ = looks.tick() => {
-                    self.look_for_hung_actors();
-                    self.rates.note(Instant::now(), self.standing.progress);
-                    self.check_balance();
-                }
-            }
-            self.time_waits();
-            self.stop_if_drained();
+    /// What is to be done after what happened at this moment, counted from the learner's beginning.
+    pub fn handle(&mut self, input: Input, now: Duration) -> Vec<Effect> {
+        self.now = now;
+        let mut effects = Vec::new();
+        self.take(input, &mut effects);
+        self.time_waits();
+        self.stop_if_drained(&mut effects);
+        let waited = self.over_since.is_some_and(|since| now.saturating_sub(since) >= FAREWELL_TIMEOUT);
+        if waited && !self.actors.is_empty() {
+            let names: Vec<_> = self.actors.values().map(|actor| actor.name.as_str()).collect();
+            tracing::warn!(?names, "actors have not gone in time");
         }
-        self.state = v1::RunState::Stopping;
-        self.part_with_actors(&mut events).await;
-        self.check_balance();
-        tracing::info!(counts = ?self.ledger.counts(), "the ledger is closed");
+        if self.over_since.is_some() && (waited || self.actors.is_empty()) {
+            effects.push(Effect::Close);
+        }
+        effects
+    }
+
+    /// The ledger's counts.
+    pub fn counts(&self) -> Counts {
+        self.ledger.counts()
     }
 
     /// Who waits for whom. Nobody does while the run is paused or ending.
     fn time_waits(&mut self) {
-        let (now, running) = (Instant::now(), self.state == v1::RunState::Running);
+        let (now, running) = (self.now, self.state == v1::RunState::Running);
         self.learner_waiting.set(running && self.batches_in_training == 0, now);
         for (&id, actor) in &mut self.actors {
             actor.waiting.set(running && actor.is_idle(id, &self.ledger), now);
         }
+    }
+
+    fn look(&mut self, effects: &mut Vec<Effect>) {
+        let late = self.now.saturating_sub(self.looked);
+        if late > LATE_LOOK {
+            // This process stood still: nobody is silent who could not be heard.
+            let shift = late - LOOK_EVERY;
+            self.actors.values_mut().for_each(|actor| actor.heard += shift);
+            self.moved_at += shift;
+        }
+        self.looked = self.now;
+        self.look_for_hung_actors(effects);
+        self.look_for_standstill();
+        self.rates.note(self.now, self.standing.progress);
+        self.check_balance();
     }
 
     fn check_balance(&mut self) {
@@ -224,63 +204,54 @@ impl Coordinator {
     }
 
     fn happened(&mut self, what: String) {
-        self.happenings.note(self.standing.progress.env_steps, what);
+        self.happenings.note(self.now, self.standing.progress.env_steps, what);
     }
 
     /// What somebody should know of.
     fn warned(&mut self, what: String) {
-        self.happenings.warn(self.standing.progress.env_steps, what);
+        self.happenings.warn(self.now, self.standing.progress.env_steps, what);
     }
 
-    fn handle(&mut self, event: Event) {
-        match event {
-            Event::Episode(actor, episode) => {
+    fn take(&mut self, input: Input, effects: &mut Vec<Effect>) {
+        match input {
+            Input::Episode(actor, episode) => {
                 self.frames += 1;
-                self.insert(actor, *episode);
+                self.insert(actor, *episode, effects);
             }
-            Event::FrameRefused(reason) => {
+            Input::FrameRefused(reason) => {
                 self.frames += 1;
                 *self.frames_refused.entry(reason).or_default() += 1;
             }
-            Event::Join(hello, to, answer) => {
-                let joined = self.join(hello, to);
-                let id = joined.as_ref().ok().copied();
-                if answer.send(joined).is_ok() {
-                    if let Some(id) = id {
-                        self.send(id, Message::Welcome(v1::Welcome { actor: id, ..self.welcome.clone() }));
-                        self.hand_out();
-                    }
-                } else if let Some(id) = id {
-                    self.gone(id);
-                }
-            }
-            Event::Done(actor, lease) => {
-                self.heard(actor);
+            Input::Join(joining) => self.join(joining, effects),
+            Input::Done(actor, lease) => {
+                self.heard(actor, effects);
                 // Not all of it has come through yet, or a frame was refused: look again once all that was
                 // sent before has been read.
                 if self.has_outstanding(actor, lease) {
-                    let _ = self.fences.send(Fence { actor, lease });
+                    effects.push(Effect::Fence(Fence { actor, lease }));
                 }
             }
-            Event::Fenced(Fence { actor, lease }) => {
+            Input::Fenced(Fence { actor, lease }) => {
                 if self.has_outstanding(actor, lease) {
                     let missing = self.ledger.take_back(actor, Reason::NotArrived);
                     tracing::warn!(actor, missing, "episodes did not arrive and are handed out again");
                     self.happened(format!("{missing} episodes did not arrive and are handed out again"));
-                    self.hand_out();
+                    self.part_if_done(actor, effects);
+                    self.hand_out(effects);
                 }
             }
-            Event::Heartbeat(actor) => self.heard(actor),
-            Event::Leaving(actor) => {
-                self.heard(actor);
+            Input::Heartbeat(actor) => self.heard(actor, effects),
+            Input::Leaving(actor) => {
+                self.heard(actor, effects);
                 if let Some(leaving) = self.actors.get_mut(&actor) {
                     leaving.leaving = true;
                 }
-                self.part_if_done(actor);
+                self.part_if_done(actor, effects);
             }
-            Event::Gone(actor) => self.gone(actor),
-            Event::PlaceLost(notice) => self.place_lost(notice),
-            Event::News(News::Trained(terms, standing)) => {
+            Input::Gone(actor) => self.gone(actor, effects),
+            Input::PlaceLost(notice) => self.place_lost(notice, effects),
+            Input::News(News::Trained(terms, standing)) => {
+                self.moved();
                 self.ledger.open(terms);
                 self.epsilon = terms.epsilon;
                 self.batches_in_training = self.batches_in_training.saturating_sub(1);
@@ -290,12 +261,16 @@ impl Coordinator {
                 if evaluated && let Some((_, results)) = &self.standing.evaluation {
                     self.happened(format!("evaluated: {}", in_words(results)));
                 }
-                self.hand_out();
+                self.hand_out(effects);
             }
-            Event::News(News::Ending) => self.state = v1::RunState::Stopping,
-            Event::CheckpointEnded(ended) => self.checkpoint_ended(ended),
-            Event::Over => {}
-            Event::Control(control) => self.control(control),
+            Input::News(News::Ending) => self.state = v1::RunState::Stopping,
+            Input::CheckpointEnded(ended) => self.checkpoint_ended(ended),
+            Input::Pause => self.pause(),
+            Input::Resume => self.resume(effects),
+            Input::Stop { drain } => self.stop(drain, effects),
+            Input::Set(config) => self.set(config, effects),
+            Input::Look => self.look(effects),
+            Input::Over => self.part_with_actors(effects),
         }
     }
 
@@ -318,112 +293,47 @@ impl Coordinator {
         self.happened(format!("wrote the checkpoint at {env_steps} steps in {} ms", duration.as_millis()));
     }
 
-    fn join(
-        &mut self,
-        hello: v1::Hello,
-        to: async_mpsc::Sender<Result<LearnerMessage, Status>>,
-    ) -> Result<ActorId, Status> {
-        let v1::Hello { name, pid, layout_version, instance, remote, slot } = hello;
-        if layout_version != wire::LAYOUT_VERSION {
-            return Err(Status::failed_precondition(format!(
-                "actor {name} writes frame layout {layout_version}, this learner reads {}; use the same build",
-                wire::LAYOUT_VERSION
-            )));
-        }
-        // The same process, whose link broke before this side noticed; the successor of one given up; or, in a slot,
-        // whoever comes later: the supervisor starts nobody beside another.
-        let follows = |other: &Actor| match (slot, other.slot) {
-            (None, None) => other.name == name && (other.instance == instance || other.hung),
-            (ours, theirs) => ours == theirs,
-        };
-        if let Some(former) = self.actors.iter().find(|(_, other)| follows(other)).map(|(&id, _)| id) {
-            self.replace(former, instance);
-        }
-        let remote_max = self.config.actors.remote;
-        if remote && self.actors.values().filter(|actor| actor.remote).count() >= remote_max {
-            return Err(Status::failed_precondition(format!(
-                "actor {name} is on another host, and the learner takes {remote_max} of those; set actors.remote higher"
-            )));
-        }
-        let same_name = self.actors.values().find(|actor| actor.name == name);
-        if let Some(other) = same_name.filter(|_| slot.is_none()) {
-            return Err(Status::already_exists(format!(
-                "an actor named {name} is there already (process {}); choose another --name",
-                other.pid
-            )));
-        }
-        let id = self.next_actor;
-        self.next_actor += 1;
-        tracing::info!(name, pid, remote, actor = id, "an actor joined");
-        self.happened(format!("{name} joined"));
-        self.actors.insert(
-            id,
-            Actor {
-                name,
-                pid,
-                instance,
-                slot,
-                remote,
-                to,
-                episodes: 0,
-                leases: 0,
-                leaving: false,
-                heard: Instant::now(),
-                hung: false,
-                waiting: Stopwatch::default(),
-            },
-        );
-        Ok(id)
-    }
-
-    /// Lets a process of this instance take an actor's place. Another process that should still live is told.
-    fn replace(&mut self, former: ActorId, instance: u64) {
-        if let Some(actor) = self.actors.get(&former).filter(|actor| actor.instance != instance) {
-            let what = format!("another process has taken the place of {}", actor.name);
-            // One that is dead or does not read needs no word.
-            let _ = actor.to.try_send(Err(Status::already_exists(what)));
-        }
-        self.gone(former);
-    }
-
-    fn heard(&mut self, id: ActorId) {
+    fn heard(&mut self, id: ActorId, effects: &mut Vec<Effect>) {
         let Some(actor) = self.actors.get_mut(&id) else { return };
-        actor.heard = Instant::now();
+        actor.heard = self.now;
         if std::mem::take(&mut actor.hung) {
             tracing::info!(name = actor.name, actor = id, "an actor that hung is back");
             let what = format!("{} is back", actor.name);
             self.happened(what);
-            self.hand_out();
+            self.part_if_done(id, effects);
+            self.hand_out(effects);
         }
     }
 
-    fn look_for_hung_actors(&mut self) {
+    fn look_for_hung_actors(&mut self, effects: &mut Vec<Effect>) {
         let timeout = Duration::from_millis(self.config.actors.heartbeat_timeout_ms);
-        let silent = |actor: &Actor| !actor.hung && actor.heard.elapsed() >= timeout;
+        let now = self.now;
+        let silent = |actor: &Actor| !actor.hung && now.saturating_sub(actor.heard) >= timeout;
         let hung: Vec<ActorId> = self.actors.iter().filter(|(_, a)| silent(a)).map(|(&id, _)| id).collect();
         for id in hung {
             let had = self.ledger.take_back(id, Reason::ActorHung);
             if let Some(actor) = self.actors.get_mut(&id) {
                 actor.hung = true;
-                let silent_s = actor.heard.elapsed().as_secs_f64();
+                let silent_s = now.saturating_sub(actor.heard).as_secs_f64();
                 tracing::warn!(name = actor.name, actor = id, had, silent_s, "an actor hangs");
                 let what = format!("{} hangs; its {had} episodes go to another", actor.name);
                 self.happened(what);
             }
-            self.hand_out();
+            self.hand_out(effects);
         }
     }
 
-    fn gone(&mut self, id: ActorId) {
+    fn gone(&mut self, id: ActorId, effects: &mut Vec<Effect>) {
         let Some(actor) = self.actors.remove(&id) else { return };
+        effects.push(Effect::Dismiss(id));
         let had = self.ledger.take_back(id, Reason::ActorGone);
         tracing::info!(name = actor.name, actor = id, had, "an actor has gone");
         self.happened(format!("{} has gone; it had {had} episodes", actor.name));
-        self.hand_out();
+        self.hand_out(effects);
     }
 
     /// Ends the sessions of this host's actors, which join again where shared memory is now.
-    fn place_lost(&mut self, notice: Option<String>) {
+    fn place_lost(&mut self, notice: Option<String>, effects: &mut Vec<Effect>) {
         self.warned(
             "the folder of the run's shared memory was removed while it ran; it is made anew, and actors join again"
                 .into(),
@@ -431,30 +341,30 @@ impl Coordinator {
         notice.into_iter().for_each(|notice| self.warned(notice));
         let here: Vec<ActorId> =
             self.actors.iter().filter(|(_, actor)| !actor.remote).map(|(&id, _)| id).collect();
-        here.into_iter().for_each(|id| self.gone(id));
+        here.into_iter().for_each(|id| self.gone(id, effects));
     }
 
-    fn insert(&mut self, id: ActorId, episode: Episode) {
+    fn insert(&mut self, id: ActorId, episode: Episode, effects: &mut Vec<Effect>) {
         if let Err(refused) = self.ledger.insert(id, episode) {
             // A late frame of an actor that was given up: its episode is rolled by another.
             tracing::debug!(%refused, "a frame nobody waits for");
             *self.frames_refused.entry("not_outstanding").or_default() += 1;
             return;
         }
+        self.moved();
         if let Some(actor) = self.actors.get_mut(&id) {
             actor.episodes += 1;
         }
         while let Some(batch) = self.ledger.take_batch() {
-            // Without a trainer the run is over, which `Over` says.
-            let _ = self.work.send(Work::Batch(batch));
+            effects.push(Effect::Train(batch));
             self.batches_in_training += 1;
         }
-        self.part_if_done(id);
-        self.hand_out();
+        self.part_if_done(id, effects);
+        self.hand_out(effects);
     }
 
     /// Gives every actor that has nothing to do its share of what may be rolled.
-    fn hand_out(&mut self) {
+    fn hand_out(&mut self, effects: &mut Vec<Effect>) {
         if self.state != v1::RunState::Running {
             return;
         }
@@ -463,12 +373,11 @@ impl Coordinator {
         let idle = |(id, actor): (&ActorId, &Actor)| actor.is_idle(*id, &self.ledger).then_some(*id);
         for id in self.actors.iter().filter_map(idle).collect::<Vec<_>>() {
             let Some(Lease { episodes, terms }) = self.ledger.lease(id, limit) else { return };
-            let Terms { weights_version, epsilon } = terms;
             let lease = self.actors.get_mut(&id).map_or(0, |actor| {
                 actor.leases += 1;
                 actor.leases
             });
-            self.send(id, Message::Lease(v1::Lease { episodes, weights_version, epsilon, lease }));
+            effects.push(Effect::Lease { actor: id, lease, episodes, terms });
         }
     }
 
@@ -478,42 +387,25 @@ impl Coordinator {
             && self.ledger.outstanding_with(actor).next().is_some()
     }
 
-    fn send(&mut self, id: ActorId, message: Message) {
-        let Some(actor) = self.actors.get(&id) else { return };
-        // A full queue is an actor that does not read; a closed one is an actor that has gone, and says so.
-        if actor.to.try_send(Ok(LearnerMessage { message: Some(message) })).is_err() {
-            tracing::debug!(actor = id, "an actor could not be told");
-        }
-    }
-
     /// Lets an actor go that wants to, once all it has sent is here.
-    fn part_if_done(&mut self, id: ActorId) {
+    fn part_if_done(&mut self, id: ActorId, effects: &mut Vec<Effect>) {
         let leaving = self.actors.get(&id).is_some_and(|actor| actor.leaving);
         if leaving && self.ledger.outstanding_with(id).next().is_none() {
-            self.send(id, Message::Farewell(v1::Farewell {}));
+            effects.push(Effect::Farewell(id));
         }
     }
 
-    /// The end of the run: takes back what is outstanding and waits, for a while, for everybody to go.
-    async fn part_with_actors(&mut self, events: &mut async_mpsc::Receiver<Event>) {
-        for id in self.actors.keys().copied().collect::<Vec<_>>() {
+    /// The end of the run: takes back what is outstanding and lets everybody go.
+    fn part_with_actors(&mut self, effects: &mut Vec<Effect>) {
+        if self.over_since.is_some() {
+            return;
+        }
+        self.over_since = Some(self.now);
+        self.state = v1::RunState::Stopping;
+        for &id in self.actors.keys() {
             self.ledger.take_back(id, Reason::RunEnded);
-            self.send(id, Message::Farewell(v1::Farewell {}));
+            effects.push(Effect::Farewell(id));
         }
-        let deadline = tokio::time::Instant::now() + FAREWELL_TIMEOUT;
-        while !self.actors.is_empty() {
-            match tokio::time::timeout_at(deadline, events.recv()).await {
-                Ok(Some(Event::Join(_, _, answer))) => {
-                    let _ = answer.send(Err(Status::unavailable("the run is over")));
-                }
-                Ok(Some(event)) => self.handle(event),
-                Ok(None) => return,
-                Err(_) => {
-                    let names: Vec<_> = self.actors.values().map(|actor| actor.name.as_str()).collect();
-                    tracing::warn!(?names, "actors have not gone in time");
-                    return;
-                }
-            }
-        }
+        self.check_balance();
     }
 }

@@ -1,11 +1,9 @@
-//! What the coordinator measures beside what it decides: for people, never for training.
+//! What the coordinator measures beside what it decides: for people, never for training. Moments count from the
+//! learner's beginning.
 
 use crate::checkpoint::Progress;
 use rit_proto::v1;
-use std::{
-    collections::VecDeque,
-    time::{Duration, Instant},
-};
+use std::{collections::VecDeque, time::Duration};
 
 /// Rates are taken over so long.
 const RATES_OVER: Duration = Duration::from_secs(10);
@@ -16,13 +14,13 @@ const HAPPENINGS: usize = 20;
 /// How long something lasted, all together.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Stopwatch {
-    since: Option<Instant>,
+    since: Option<Duration>,
     total: Duration,
 }
 
 impl Stopwatch {
     /// Whether it runs from now on.
-    pub fn set(&mut self, runs: bool, now: Instant) {
+    pub fn set(&mut self, runs: bool, now: Duration) {
         match (self.since, runs) {
             (None, true) => self.since = Some(now),
             (Some(since), false) => {
@@ -34,7 +32,7 @@ impl Stopwatch {
     }
 
     /// Seconds until now.
-    pub fn seconds(&self, now: Instant) -> f64 {
+    pub fn seconds(&self, now: Duration) -> f64 {
         (self.total + self.since.map_or(Duration::ZERO, |since| now - since)).as_secs_f64()
     }
 }
@@ -42,12 +40,12 @@ impl Stopwatch {
 /// How fast a run goes, over the last seconds.
 #[derive(Debug, Default)]
 pub struct RateWindow {
-    samples: VecDeque<(Instant, Progress)>,
+    samples: VecDeque<(Duration, Progress)>,
 }
 
 impl RateWindow {
     /// Notes how far training has come. Call it a few times a second.
-    pub fn note(&mut self, now: Instant, progress: Progress) {
+    pub fn note(&mut self, now: Duration, progress: Progress) {
         self.samples.push_back((now, progress));
         while self.samples.front().is_some_and(|(then, _)| now - *then > RATES_OVER) {
             self.samples.pop_front();
@@ -72,35 +70,28 @@ impl RateWindow {
 }
 
 /// The last things that happened.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Happenings {
-    began: Instant,
     last: VecDeque<v1::Happening>,
 }
 
 impl Happenings {
-    /// None yet; their times count from `began`.
-    pub fn new(began: Instant) -> Self {
-        Self { began, last: VecDeque::with_capacity(HAPPENINGS) }
-    }
-
     /// Remembers what happened, after so many environment steps.
-    pub fn note(&mut self, env_steps: u64, what: String) {
-        self.push(env_steps, what, false);
+    pub fn note(&mut self, now: Duration, env_steps: u64, what: String) {
+        self.push(now, env_steps, what, false);
     }
 
     /// Remembers what somebody should know of: it stays when what is no warning is forgotten.
-    pub fn warn(&mut self, env_steps: u64, what: String) {
-        self.push(env_steps, what, true);
+    pub fn warn(&mut self, now: Duration, env_steps: u64, what: String) {
+        self.push(now, env_steps, what, true);
     }
 
-    fn push(&mut self, env_steps: u64, what: String, warning: bool) {
+    fn push(&mut self, now: Duration, env_steps: u64, what: String, warning: bool) {
         if self.last.len() == HAPPENINGS {
             let oldest = self.last.iter().position(|happening| !happening.warning).unwrap_or(0);
             self.last.remove(oldest);
         }
-        let wall_s = self.began.elapsed().as_secs_f64();
-        self.last.push_back(v1::Happening { wall_s, env_steps, what, warning });
+        self.last.push_back(v1::Happening { wall_s: now.as_secs_f64(), env_steps, what, warning });
     }
 
     /// Oldest first.
@@ -115,8 +106,7 @@ mod tests {
 
     #[test]
     fn a_stopwatch_counts_while_it_runs() {
-        let begun = Instant::now();
-        let at = |s| begun + Duration::from_secs(s);
+        let at = Duration::from_secs;
         let mut watch = Stopwatch::default();
         watch.set(false, at(1));
         watch.set(true, at(2));
@@ -130,14 +120,13 @@ mod tests {
 
     #[test]
     fn rates_are_those_of_the_last_seconds() {
-        let begun = Instant::now();
         let mut window = RateWindow::default();
         assert_eq!(window.rates(), v1::Rates::default());
         for s in 0..=30 {
             // A fast beginning that is long past.
             let env_steps = if s < 5 { 1000 * s } else { 5000 + 20 * (s - 5) };
             let progress = Progress { env_steps, episodes: 2 * s, updates: s };
-            window.note(begun + Duration::from_secs(s), progress);
+            window.note(Duration::from_secs(s), progress);
             if s == 0 {
                 assert_eq!(window.rates(), v1::Rates::default());
             }
@@ -148,9 +137,9 @@ mod tests {
 
     #[test]
     fn the_last_happenings_are_remembered() {
-        let mut happenings = Happenings::new(Instant::now());
+        let mut happenings = Happenings::default();
         for step in 0..50 {
-            happenings.note(step, format!("step {step}"));
+            happenings.note(Duration::ZERO, step, format!("step {step}"));
         }
         let list = happenings.list();
         assert_eq!((list.len(), list[0].env_steps, list[19].what.as_str()), (20, 30, "step 49"));
@@ -158,13 +147,13 @@ mod tests {
 
     #[test]
     fn warnings_outlive_what_is_none() {
-        let mut happenings = Happenings::new(Instant::now());
-        happenings.warn(0, "the disk is full".into());
-        (0..50).for_each(|step| happenings.note(step, "an actor joined".into()));
+        let mut happenings = Happenings::default();
+        happenings.warn(Duration::ZERO, 0, "the disk is full".into());
+        (0..50).for_each(|step| happenings.note(Duration::ZERO, step, "an actor joined".into()));
         let list = happenings.list();
         assert_eq!((list.len(), list[0].what.as_str(), list[0].warning), (20, "the disk is full", true));
         assert!(list[1..].iter().all(|happening| !happening.warning));
-        (0..30).for_each(|step| happenings.warn(step, format!("warning {step}")));
+        (0..30).for_each(|step| happenings.warn(Duration::ZERO, step, format!("warning {step}")));
         assert_eq!((happenings.list().len(), happenings.list()[0].what.as_str()), (20, "warning 10"));
     }
 }

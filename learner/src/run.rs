@@ -3,7 +3,7 @@
 use crate::{
     checkpoint::{self, CheckpointError, Loaded},
     control_service::ControlService,
-    coordinator::{Coordinator, Event},
+    coordinator::{Coordinator, Event, Shell},
     episodes_service::EpisodesService,
     life::{self, EndOfLife, LifeError},
     receive::receive,
@@ -157,7 +157,8 @@ pub async fn run(
     let welcome = Welcome { actor: 0, run_id: run_dir.run_id().to_vec(), config: config.to_toml()? };
     let mut beginning = trainer.beginning();
     beginning.warnings.extend(notice);
-    let coordinator = Coordinator::new(config.clone(), welcome, beginning, work, fences);
+    let coordinator = Coordinator::new(config.clone(), beginning);
+    let coordinator = Shell::new(coordinator, welcome, work, fences);
 
     let stop = Arc::new(AtomicBool::new(false));
     let expected = Arc::new(expected);

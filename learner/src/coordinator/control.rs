@@ -1,87 +1,51 @@
-//! What callers want of a run.
+//! What people want of a run: pause, resume, stop, other settings.
 
-use super::Coordinator;
-use crate::trainer::{Checkpointed, Work};
+use super::{Coordinator, Effect};
 use rit_config::Config;
-use rit_proto::v1;
+use rit_proto::v1::RunState;
 use std::sync::Arc;
-use tokio::sync::oneshot;
-
-/// What callers want, each with the way to answer.
-#[derive(Debug)]
-pub enum Control {
-    /// How the run stands.
-    Status(oneshot::Sender<v1::RunStatus>),
-    /// No further lease.
-    Pause(oneshot::Sender<v1::RunStatus>),
-    /// Leases again.
-    Resume(oneshot::Sender<v1::RunStatus>),
-    /// A checkpoint.
-    Checkpoint(oneshot::Sender<Checkpointed>),
-    /// The end of the run, with what is under way (`drain`) or without.
-    Stop {
-        /// Whether episodes under way are waited for.
-        drain: bool,
-        /// The way to answer.
-        answer: oneshot::Sender<v1::RunStatus>,
-    },
-    /// Other settings from now on.
-    Set(Arc<Config>, oneshot::Sender<v1::RunStatus>),
-}
 
 impl Coordinator {
-    pub(super) fn control(&mut self, control: Control) {
-        // Whoever asked may have gone; the answers are then nobody's.
-        match control {
-            Control::Status(answer) => {
-                let _ = answer.send(self.status());
-            }
-            Control::Pause(answer) => {
-                if self.state == v1::RunState::Running {
-                    self.state = v1::RunState::Paused;
-                    tracing::info!("paused");
-                    self.happened("paused".into());
-                }
-                let _ = answer.send(self.status());
-            }
-            Control::Resume(answer) => {
-                if self.state == v1::RunState::Paused {
-                    self.state = v1::RunState::Running;
-                    tracing::info!("resumed");
-                    self.happened("resumed".into());
-                    self.hand_out();
-                }
-                let _ = answer.send(self.status());
-            }
-            Control::Checkpoint(answer) => {
-                let _ = self.work.send(Work::Checkpoint(answer));
-            }
-            Control::Stop { drain, answer } => {
-                tracing::info!(drain, "asked to stop");
-                self.happened("asked to stop".into());
-                self.state = v1::RunState::Stopping;
-                self.draining = drain;
-                if drain {
-                    self.stop_if_drained();
-                } else {
-                    let _ = self.work.send(Work::Stop);
-                }
-                let _ = answer.send(self.status());
-            }
-            Control::Set(config, answer) => {
-                self.config = Config::clone(&config);
-                let _ = self.work.send(Work::Set(config));
-                self.happened("settings changed".into());
-                let _ = answer.send(self.status());
-            }
+    pub(super) fn pause(&mut self) {
+        if self.state == RunState::Running {
+            self.state = RunState::Paused;
+            self.stands_still = None;
+            tracing::info!("paused");
+            self.happened("paused".into());
         }
     }
 
+    pub(super) fn resume(&mut self, effects: &mut Vec<Effect>) {
+        if self.state == RunState::Paused {
+            self.state = RunState::Running;
+            self.moved_at = self.now;
+            tracing::info!("resumed");
+            self.happened("resumed".into());
+            self.hand_out(effects);
+        }
+    }
+
+    pub(super) fn stop(&mut self, drain: bool, effects: &mut Vec<Effect>) {
+        tracing::info!(drain, "asked to stop");
+        self.happened("asked to stop".into());
+        self.state = RunState::Stopping;
+        self.draining = drain;
+        if !drain {
+            effects.push(Effect::EndTraining);
+        }
+    }
+
+    pub(super) fn set(&mut self, config: Arc<Config>, effects: &mut Vec<Effect>) {
+        self.config = Config::clone(&config);
+        effects.push(Effect::Configure(config));
+        self.happened("settings changed".into());
+    }
+
     /// Ends the run once nothing is under way any more; batches that are full are trained on first.
-    pub(super) fn stop_if_drained(&mut self) {
+    pub(super) fn stop_if_drained(&mut self, effects: &mut Vec<Effect>) {
         if self.draining && self.ledger.counts().outstanding == 0 {
             self.draining = false;
-            let _ = self.work.send(Work::Stop);
+            effects.push(Effect::EndTraining);
         }
     }
 }

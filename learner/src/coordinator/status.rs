@@ -9,12 +9,12 @@ use crate::{
 };
 use rit_episode::wire::{Header, PayloadLayout};
 use rit_proto::v1;
-use std::time::Instant;
+use std::time::Duration;
 
 impl Coordinator {
-    pub(super) fn status(&self) -> v1::RunStatus {
+    /// How the run stands, at this moment since the learner's beginning.
+    pub fn status(&self, now: Duration) -> v1::RunStatus {
         let Standing { progress, measured, recent, evaluation, replay_episodes } = &self.standing;
-        let now = Instant::now();
         let messages = |results: &[TaskResult]| results.iter().map(TaskResult::to_message).collect();
         // All frames of a run have the same length.
         let frame_bytes = size_of::<Header>() + PayloadLayout::new(self.config.dims()).len();
@@ -25,7 +25,7 @@ impl Coordinator {
             episodes: progress.episodes,
             updates: progress.updates,
             epsilon: self.epsilon.into(),
-            wall_s: (now - self.started).as_secs_f64(),
+            wall_s: now.as_secs_f64(),
             recent: messages(recent),
             evaluation: evaluation.as_ref().map(|(progress, results)| v1::Evaluation {
                 env_steps: progress.env_steps,
@@ -48,13 +48,13 @@ impl Coordinator {
         }
     }
 
-    fn actor_status(&self, id: ActorId, actor: &Actor, now: Instant) -> v1::ActorStatus {
+    fn actor_status(&self, id: ActorId, actor: &Actor, now: Duration) -> v1::ActorStatus {
         v1::ActorStatus {
             name: actor.name.clone(),
             pid: actor.pid,
             episodes: actor.episodes,
             outstanding: self.ledger.outstanding_with(id).count() as u64,
-            silent_s: (now - actor.heard).as_secs_f64(),
+            silent_s: now.saturating_sub(actor.heard).as_secs_f64(),
             hung: actor.hung,
             remote: actor.remote,
             waiting_s: actor.waiting.seconds(now),

@@ -1,0 +1,51 @@
+//! A run that should go on and does not says so, and why.
+
+use super::Coordinator;
+use rit_proto::v1::RunState;
+use std::time::Duration;
+
+/// A run that is not paused and makes no step for so long stands still.
+pub const STANDSTILL_AFTER: Duration = Duration::from_secs(60);
+
+impl Coordinator {
+    /// Something went on: an episode came, a batch is done, or somebody let the run go on.
+    pub(super) fn moved(&mut self) {
+        self.moved_at = self.now;
+        if self.stands_still.take().is_some() {
+            self.warned("the run goes on".into());
+        }
+    }
+
+    /// Why the run stands still, if it does.
+    pub fn stands_still(&self) -> Option<&str> {
+        self.stands_still.as_deref()
+    }
+
+    pub(super) fn look_for_standstill(&mut self) {
+        if self.state != RunState::Running || self.stands_still.is_some() {
+            return;
+        }
+        let still = self.now.saturating_sub(self.moved_at);
+        if still >= STANDSTILL_AFTER {
+            let why = self.why_still();
+            self.warned(format!("no step for {} s: {why}", still.as_secs()));
+            self.stands_still = Some(why);
+        }
+    }
+
+    fn why_still(&self) -> String {
+        let (all, outstanding) = (self.actors.len(), self.ledger.counts().outstanding);
+        let hung = self.actors.values().filter(|actor| actor.hung).count();
+        if self.batches_in_training > 0 {
+            "training is busy with one batch or an evaluation".into()
+        } else if all == 0 {
+            "no actor is there".into()
+        } else if hung == all {
+            format!("no sign of life from any of {all} actors")
+        } else if outstanding > 0 {
+            format!("{all} actors roll {outstanding} episodes, and none of these arrives")
+        } else {
+            format!("{all} actors are there, and none of them rolls an episode")
+        }
+    }
+}
