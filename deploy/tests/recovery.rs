@@ -111,7 +111,10 @@ fn an_actor_that_is_told_to_leave_is_replaced() {
         });
         let victim = actor_pid(&status, name).unwrap();
         kill(victim, signal);
+        // Else the run may be over before its successor is there.
+        assert!(train.ctl(&["pause"]).status.success());
         train.wait_for("its successor", |status| actor_pid(status, name).is_some_and(|pid| pid != victim));
+        assert!(train.ctl(&["resume"]).status.success());
     }
     let undisturbed = RunFolder::new().train(&[RUN, &["--actors", "1", "--steps", "3000"]].concat());
     assert_eq!(train.finish()["weights_digest"], undisturbed["weights_digest"]);
