@@ -33,7 +33,7 @@ pub enum Command {
     Ctl(CtlOptions),
     /// Watch a run in the terminal; q or Ctrl-C ends the view, not the run
     Watch(WatchOptions),
-    /// Kill a run's processes at random moments, and hold its end to that of an undisturbed run
+    /// Kill a run's processes at random moments, and hold its end to that of an undisturbed run; or simulate that
     Soak(SoakOptions),
     /// Measure a part beside the machine's limit
     Bench(BenchOptions),
@@ -261,6 +261,14 @@ pub struct SoakOptions {
     /// Set any key of both runs; may be given again and again
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub settings: Vec<String>,
+    /// Drive the supervisor, the coordinator and the ledger alone through random scenarios, without processes: joins,
+    /// deaths, hangs, restarts, pauses, settings, slow and lost messages, late frames, full disks. Scenario i has the
+    /// seed --seed + i
+    #[arg(long, conflicts_with_all = ["experiment", "kills", "actors", "steps", "settings", "dir"])]
+    pub simulated: bool,
+    /// Scenarios
+    #[arg(long, value_name = "N", default_value_t = 10_000, requires = "simulated", value_parser = clap::value_parser!(u64).range(1..=1_000_000_000_000))]
+    pub runs: u64,
     /// Folder for both runs and their logs, to be made
     #[arg(long, value_name = "DIR", default_value = "runs/soak")]
     pub dir: PathBuf,

@@ -31,6 +31,9 @@ const SILENCE_MAX: Duration = Duration::from_secs(30);
 /// ... but only if it was asked in vain so often: else this process itself stood still.
 const SILENT_ASKS_MIN: u32 = 5;
 
+/// From the moment that an actor has left, unasked, to the start of another.
+const LEFT_DELAY: Duration = Duration::from_millis(500);
+
 /// The process of one place.
 #[derive(Debug, Default)]
 struct Process {
@@ -43,8 +46,8 @@ enum State {
     /// None, and none is awaited.
     #[default]
     Down,
-    /// None, and it is started at this moment.
-    Due(Duration),
+    /// None, and it is started at this moment, with these words if any.
+    Due(Duration, Option<String>),
     Up(Up),
 }
 
@@ -74,7 +77,7 @@ impl Process {
     fn deadline(&self) -> Option<Duration> {
         match &self.state {
             State::Down => None,
-            State::Due(at) => Some(*at),
+            State::Due(at, _) => Some(*at),
             State::Up(up) => up.kill_at.filter(|_| !up.killed),
         }
     }
@@ -390,17 +393,19 @@ impl Supervisor {
         let Some(delay) = self.process(place).restarts.died(now) else {
             return self.give_up(place, last_words, now, effects);
         };
-        let words = match exit {
-            Exit::Code(0) => "has left".to_owned(),
-            exit => exit.to_string(),
-        };
+        if *exit == Exit::Code(0) {
+            // A run that ends lets its actors go before it says so: then nobody is to be started.
+            let say = format!("{place} had left and is started again");
+            self.process(place).state = State::Due(now + delay.max(LEFT_DELAY), Some(say));
+            return;
+        }
         let when = if delay.is_zero() { String::new() } else { format!(" in {} s", delay.as_secs_f64()) };
         let name = if place == Place::Learner { "the learner".to_owned() } else { place.to_string() };
-        effects.push(Effect::Say(format!("{name} {words} and is restarted{when}")));
+        effects.push(Effect::Say(format!("{name} {exit} and is restarted{when}")));
         if delay.is_zero() {
             self.start(place, now, effects);
         } else {
-            self.process(place).state = State::Due(now + delay);
+            self.process(place).state = State::Due(now + delay, None);
         }
     }
 
@@ -434,7 +439,7 @@ impl Supervisor {
         let slots: Vec<u32> = self.actors.keys().copied().collect();
         for place in slots.into_iter().map(Place::Actor).chain([Place::Learner]) {
             let process = self.process(place);
-            if matches!(process.state, State::Due(_)) {
+            if matches!(process.state, State::Due(..)) {
                 process.state = State::Down;
             }
             self.ask_to_end(place, Some(now + END_TIMEOUT), effects);
@@ -450,7 +455,7 @@ impl Supervisor {
             Phase::Anew(due) => {
                 self.phase = Phase::Running;
                 self.actors.clear();
-                self.learner.state = State::Due(due);
+                self.learner.state = State::Due(due, None);
                 effects.push(Effect::RemoveSharedMemory);
             }
             Phase::Ending(outcome) => effects.push(Effect::Over(outcome)),
@@ -462,7 +467,10 @@ impl Supervisor {
         let slots: Vec<u32> = self.actors.keys().copied().collect();
         for place in slots.into_iter().map(Place::Actor).chain([Place::Learner]) {
             match &self.process(place).state {
-                State::Due(at) if *at <= now => self.start(place, now, effects),
+                State::Due(at, say) if *at <= now => {
+                    effects.extend(say.clone().map(Effect::Say));
+                    self.start(place, now, effects);
+                }
                 State::Up(Up { kill_at: Some(at), .. }) if *at <= now => self.kill(place, effects),
                 _ => {}
             }

@@ -2,6 +2,7 @@
 //! run left in peace. Nothing may be lost, nothing may come twice, and the weights must be the same to the last bit.
 
 mod fire;
+mod simulated;
 
 use crate::{cli::SoakOptions, experiments, failure::Failure, output};
 use fire::{Kill, Run, Victim};
@@ -43,6 +44,9 @@ struct Times {
 /// # Errors
 /// When a run fails; a run that ends otherwise than the undisturbed one is no error here but exit code 1.
 pub async fn run(options: SoakOptions) -> Result<ExitCode, Failure> {
+    if options.simulated {
+        return simulated::run(options.runs, options.seed, options.json);
+    }
     let folder = &options.dir;
     if folder.exists() {
         let folder = folder.display();
