@@ -43,6 +43,12 @@ pub struct Rows {
     pub entities: Vec<f32>,
     /// The entity row of each agent row.
     pub agent_entities: Vec<usize>,
+    /// Features of distinct entities, `[distinct, d]`: one that has not changed since the step before has no other row.
+    distinct: Vec<f32>,
+    /// The distinct row of each entity row.
+    distinct_of: Vec<usize>,
+    /// The distinct row of each agent row.
+    pub agent_distinct: Vec<usize>,
     /// Which of the group's entities each agent sees: the groups' `[n, m]` one after another.
     pub observable: Vec<u8>,
     /// The same with each agent itself left out.
@@ -110,7 +116,7 @@ impl Rows {
             let step =
                 Step { episode: index, time: 0, reward: 0.0, filled: false, terminated: false, task: 0 };
             self.push_group(seen.n_agents(), seen.n_entities(), step, turn.previous_reward);
-            self.push_state(seen.n_agents(), seen.n_entities(), seen.entities(), seen.observable());
+            self.push_state(seen.n_agents(), seen.n_entities(), seen.entities(), seen.observable(), None);
             self.available.extend_from_slice(seen.available());
             self.places.push(index);
         }
@@ -136,6 +142,17 @@ impl Rows {
             cols: self.entity_dim,
             stride: self.entity_dim,
         }
+    }
+
+    /// Features of distinct entities, (distinct, d).
+    pub fn distinct(&self) -> View<'_> {
+        let d = self.entity_dim;
+        View { data: &self.distinct, rows: self.distinct.len() / d.max(1), cols: d, stride: d }
+    }
+
+    /// The distinct row of each entity row; `None` where each has its own, in the same order.
+    pub fn distinct_rows(&self) -> Option<&[usize]> {
+        (self.distinct.len() < self.entities.len()).then_some(&self.distinct_of)
     }
 
     /// The group of an episode, by its index in the batch, at a time it reaches.
@@ -173,6 +190,9 @@ impl Rows {
         self.group_times.clear();
         self.entities.clear();
         self.agent_entities.clear();
+        self.distinct.clear();
+        self.distinct_of.clear();
+        self.agent_distinct.clear();
         self.observable.clear();
         self.others.clear();
         self.available.clear();
@@ -196,7 +216,8 @@ impl Rows {
         let n_actions = episode.available.len() / ((steps + 1) * n);
         let part = |width: usize| time * width..(time + 1) * width;
         self.push_group(n, m, step, if time == 0 { 0.0 } else { episode.rewards[time - 1] });
-        self.push_state(n, m, &episode.entities[part(m * d)], &episode.observable[part(n * m)]);
+        let before = (time > 0).then(|| self.groups[self.group_of(index, time - 1)].keys.start);
+        self.push_state(n, m, &episode.entities[part(m * d)], &episode.observable[part(n * m)], before);
         self.available.extend_from_slice(&episode.available[part(n * n_actions)]);
         if filled {
             self.actions.extend_from_slice(&episode.actions[part(n)]);
@@ -213,8 +234,31 @@ impl Rows {
         self.previous_rewards.push(previous_reward);
     }
 
-    fn push_state(&mut self, n_agents: usize, n_entities: usize, entities: &[f32], observable: &[u8]) {
-        self.entity_dim = entities.len() / n_entities;
+    /// `before` is the first entity row of the same episode's step before.
+    fn push_state(
+        &mut self,
+        n_agents: usize,
+        n_entities: usize,
+        entities: &[f32],
+        observable: &[u8],
+        before: Option<usize>,
+    ) {
+        let d = entities.len() / n_entities;
+        self.entity_dim = d;
+        let first = self.distinct_of.len();
+        for (row, features) in entities.chunks_exact(d).enumerate() {
+            let unchanged = before.map(|before| before + row).filter(|&row| {
+                let last = &self.entities[row * d..(row + 1) * d];
+                // Bit by bit: what is no number is not equal to itself.
+                last.iter().zip(features).all(|(a, b)| a.to_bits() == b.to_bits())
+            });
+            let distinct = unchanged.map_or(self.distinct.len() / d, |row| self.distinct_of[row]);
+            if unchanged.is_none() {
+                self.distinct.extend_from_slice(features);
+            }
+            self.distinct_of.push(distinct);
+        }
+        self.agent_distinct.extend_from_slice(&self.distinct_of[first..first + n_agents]);
         self.entities.extend_from_slice(entities);
         self.observable.extend_from_slice(observable);
         let first = self.others.len();
@@ -276,11 +320,28 @@ mod tests {
         assert_eq!(rows.others[..8], [0, 1, 1, 1, 0, 1, 0, 1]);
         assert_eq!(rows.observable, [1; 22]);
         assert_eq!(rows.agent_entities, [0, 1, 3, 5, 6, 8, 10, 11]);
+        assert_eq!((rows.distinct_rows(), &rows.agent_distinct), (None, &rows.agent_entities));
         let next: Vec<_> = (0..5).map(|group| rows.next_group(group)).collect();
         assert_eq!(next, [Some(2), Some(3), Some(4), None, None]);
         // The contrastive order is the batch's: short's one row, then long's four.
         let ordered: Vec<_> = rows.filled_agent_rows().map(|(row, step)| (row, step.task)).collect();
         assert_eq!(ordered, [(2, 1), (0, 2), (1, 2), (3, 2), (4, 2)]);
+    }
+
+    #[test]
+    fn entities_that_do_not_change_share_a_row() {
+        let mut moving = episode(1, 1, 3, 3, End::Truncated);
+        // Of three entities over four states, the second never moves, the third in the third state only.
+        moving.entities = [[1.0, 5.0, 7.0], [2.0, 5.0, 7.0], [3.0, 5.0, 8.0], [4.0, 5.0, 8.0]].concat();
+        let still = Episode { entities: vec![1.0, 1.0], ..episode(2, 1, 1, 1, End::Truncated) };
+        let rows = Rows::of_episodes(&[&moving, &still], TerminalStates::Kept);
+        // Times: (moving, still), (moving, still), moving, moving.
+        assert_eq!(rows.distinct().data, [1.0, 5.0, 7.0, 1.0, 2.0, 3.0, 8.0, 4.0]);
+        let expected = [0, 1, 2, 3, 4, 1, 2, 3, 5, 1, 6, 7, 1, 6];
+        assert_eq!(rows.distinct_rows(), Some(&expected[..]));
+        assert_eq!(rows.agent_distinct, [0, 3, 4, 3, 5, 7]);
+        let shown: Vec<f32> = expected.iter().map(|&row| rows.distinct().data[row]).collect();
+        assert_eq!(shown, rows.entities);
     }
 
     #[test]

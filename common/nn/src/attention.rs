@@ -152,9 +152,9 @@ impl Attention {
         }
     }
 
-    /// The value layer alone, h → a, and whether ReLU follows.
-    pub fn value(&self) -> (Linear, bool) {
-        (self.key_value.output_rows(self.dim..2 * self.dim), self.values == Values::Rectified)
+    /// The value layer alone, h → a, without what becomes of values behind it.
+    pub fn value(&self) -> Linear {
+        self.key_value.output_rows(self.dim..2 * self.dim)
     }
 
     /// The key layer alone, h → a.

@@ -8,7 +8,7 @@
 use crate::{Accum, Attention, Linear, View, ViewMut, linear, math, matmul, vectorized};
 
 /// Which layers are derived, and from what.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Derived {
     /// Parameters.
     parameters: usize,
@@ -18,7 +18,7 @@ pub struct Derived {
 }
 
 /// A derived layer.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq)]
 enum Made {
     /// `of` = `second` ∘ `first`, beside the rest of `second`'s inputs.
     Chain { first: Linear, second: Linear, of: Linear },

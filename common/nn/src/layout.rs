@@ -1,5 +1,6 @@
 //! Names and shapes of all parameters, declared once, in the order in which they lie in the flat buffer.
 
+use crate::Derived;
 use rand::{Rng, RngExt as _};
 use std::ops::Range;
 
@@ -34,9 +35,26 @@ pub enum Initial {
 pub struct Layout {
     params: Vec<Param>,
     len: usize,
+    derived: Derived,
 }
 
 impl Layout {
+    /// Declares a network that may have derived layers. They lie behind all of its parameters, so it declares itself
+    /// twice: the first time only counts.
+    pub fn of<T>(declare: impl Fn(&mut LayoutBuilder) -> T) -> (T, Self) {
+        let mut counting = LayoutBuilder::default();
+        declare(&mut counting);
+        let mut builder = LayoutBuilder::default();
+        builder.layout.derived = Derived::new(counting.len());
+        let network = declare(&mut builder);
+        (network, builder.finish())
+    }
+
+    /// The layers that are made of others.
+    pub fn derived(&self) -> &Derived {
+        &self.derived
+    }
+
     /// Every parameter, in the buffer's order.
     pub fn params(&self) -> &[Param] {
         &self.params
@@ -105,6 +123,11 @@ impl LayoutBuilder {
             param.initial = if param.shape.len() > 1 { Initial::Orthogonal(gain) } else { Initial::Zeros };
         }
         declared
+    }
+
+    /// The derived layers, to declare more; see [`Layout::of`].
+    pub fn derived(&mut self) -> &mut Derived {
+        &mut self.layout.derived
     }
 
     /// Numbers declared so far: where the next parameter will begin.

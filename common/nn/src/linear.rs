@@ -4,7 +4,7 @@ use crate::{Accum, LayoutBuilder, View, ViewMut, math, matmul, vectorized};
 use std::ops::Range;
 
 /// A linear layer, or several over the same input that lie side by side and are computed as one.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Linear {
     weight: Range<usize>,
     bias: Range<usize>,

@@ -2,24 +2,32 @@
 //! embedded, then each agent attends over entities.
 
 use crate::Rows;
-use rit_nn::{Attention, LayoutBuilder, Linear, Tape, Var, attention::Visible};
+use rit_nn::{Attention, LayoutBuilder, Linear, Tape, Var, attention::Visible, tape::Over};
 
 /// x = ReLU(`embed`(entities)), d → h, and `attention` of the agents over them, a.
+///
+/// With q = W_q x_k + b_q, a score q · W_k x_j is (W_kᵀ q) · x_j: the product of both weights is a layer of its own,
+/// [derived](rit_nn::Derived) once for one set of weights, and entities need no keys. Entities that have not changed since
+/// the step before share a row ([`Rows::distinct`]).
 #[derive(Clone, Debug)]
 pub struct Encoder {
     /// d → h.
-    pub embed: Linear,
+    embed: Linear,
     /// Of agents over entities, a.
-    pub attention: Attention,
+    attention: Attention,
+    /// x_k to what scores are made with, h → heads · h.
+    scores: Linear,
+    /// h → a, with ReLU.
+    value: Linear,
 }
 
-/// What every entity is, to whoever attends over them. With E entity and R agent rows:
+/// What every distinct entity is, to whoever attends over them.
 #[derive(Clone, Copy, Debug)]
 pub struct Entities {
-    /// x, (E, h).
+    /// x, (distinct, h).
     pub x: Var,
-    /// Keys and values, (E, 2a).
-    pub key_values: Var,
+    /// (distinct, a).
+    pub values: Var,
 }
 
 impl Encoder {
@@ -35,7 +43,9 @@ impl Encoder {
         let embed = Linear::new(layout, &format!("{name}.embed"), entity_dim, hidden_dim);
         let attention =
             Attention::new(layout, &format!("{name}.attention"), hidden_dim, attention_dim, heads);
-        Self { embed, attention }
+        let scores = layout.derived().scores(&attention);
+        let value = attention.value();
+        Self { embed, attention, scores, value }
     }
 
     /// h.
@@ -50,41 +60,57 @@ impl Encoder {
 
     /// Embeds all entities.
     pub fn entities<'a>(&self, tape: &mut Tape<'a>, rows: &'a Rows) -> Entities {
-        let entities = tape.constant(rows.entities());
+        let entities = tape.constant(rows.distinct());
         let x = tape.linear_relu(&self.embed, entities);
-        let key_values = tape.key_values(&self.attention, x);
-        Entities { x, key_values }
+        let values = tape.linear_relu(&self.value, x);
+        Entities { x, values }
     }
 
-    /// The agents' queries, (R, a).
+    /// The agents' queries, (R, heads · h).
     pub fn queries<'a>(&self, tape: &mut Tape<'a>, rows: &'a Rows, entities: Entities) -> Var {
-        let own = tape.gather(entities.x, &rows.agent_entities);
-        let queries = tape.linear(&self.attention.query, own);
+        let own = tape.gather(entities.x, &rows.agent_distinct);
+        let queries = tape.linear(&self.scores, own);
         tape.free(own);
         queries
     }
 
-    /// Each agent's attention over the entities it is shown under M masks, (R M, a): row `r M + i` is agent row r's under
+    /// Writes what agents see of the entities under M masks into `out` (R M, a): row `r M + i` is agent row r's under
     /// mask i.
+    pub fn attend<'a>(
+        &self,
+        tape: &mut Tape<'a>,
+        rows: &'a Rows,
+        (queries, entities): (Var, Entities),
+        masks: &[Visible<'a>],
+        out: Var,
+    ) {
+        let Entities { x, values } = entities;
+        let (heads, head_dim) = (self.attention.heads, self.attention.dim / self.attention.heads);
+        let over = Over { queries, keys: x, values, rows: rows.distinct_rows(), heads, head_dim };
+        tape.attend_over(over, &rows.groups, masks, out);
+    }
+
+    /// Each agent's attention over the entities it is shown under M masks, (R M, a), rows as [`Encoder::attend`] has
+    /// them.
     pub fn within<'a>(&self, tape: &mut Tape<'a>, rows: &'a Rows, masks: &[Visible<'a>]) -> Var {
         let entities = self.entities(tape, rows);
         let queries = self.queries(tape, rows, entities);
-        tape.free(entities.x);
         let out = tape.reserve(queries.rows * masks.len(), self.attention_dim());
-        tape.attend_into(&self.attention, queries, entities.key_values, &rows.groups, masks, out);
-        tape.free(queries);
-        tape.free(entities.key_values);
+        self.attend(tape, rows, (queries, entities), masks, out);
+        for var in [queries, entities.x, entities.values] {
+            tape.free(var);
+        }
         out
     }
 
     /// [x_k ‖ each agent's attention over the entities it sees beside itself], (R, h + a): its own features are there
     /// already.
     pub fn beside<'a>(&self, tape: &mut Tape<'a>, rows: &'a Rows) -> Var {
-        self.beside_under(tape, rows, &rows.agent_entities, &[Visible::Where(&rows.others)])
+        self.beside_under(tape, rows, &rows.agent_distinct, &[Visible::Where(&rows.others)])
     }
 
-    /// The same under M masks, none of which shows an agent itself, rows as [`Encoder::within`] has them. `own` are the
-    /// entity rows of their agents, `[R M]`.
+    /// The same under M masks, none of which shows an agent itself, rows as [`Encoder::attend`] has them. `own` are the
+    /// distinct entities that their agents are, `[R M]`.
     pub fn beside_under<'a>(
         &self,
         tape: &mut Tape<'a>,
@@ -97,15 +123,12 @@ impl Encoder {
         let encoded = tape.reserve(own.len(), h + a);
         let (x, attended) = (encoded.columns(0..h), encoded.columns(h..h + a));
         tape.gather_into(entities.x, own, x);
-        let queries = if masks.len() == 1 {
-            tape.linear(&self.attention.query, x)
-        } else {
-            self.queries(tape, rows, entities)
-        };
-        tape.free(entities.x);
-        tape.attend_into(&self.attention, queries, entities.key_values, &rows.groups, masks, attended);
-        tape.free(queries);
-        tape.free(entities.key_values);
+        let queries =
+            if masks.len() == 1 { tape.linear(&self.scores, x) } else { self.queries(tape, rows, entities) };
+        self.attend(tape, rows, (queries, entities), masks, attended);
+        for var in [queries, entities.x, entities.values] {
+            tape.free(var);
+        }
         encoded
     }
 }

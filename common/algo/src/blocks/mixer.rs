@@ -20,9 +20,8 @@ use rit_nn::{
 pub struct Mixer {
     /// Over all present entities.
     pub encoder: Encoder,
-    /// a → h.
-    out: Linear,
-    /// `w1_hidden`, `w2_hidden`, `b2_hidden` and `b1` side by side over c.
+    /// `w1_hidden`, `w2_hidden`, `b2_hidden` and `b1` side by side over c, behind `out` (a → h): [attention ‖ z] to all
+    /// of them, derived.
     hyper: Linear,
     /// The first of these by itself.
     w1_hidden: Linear,
@@ -36,7 +35,7 @@ pub struct Mixer {
 pub struct MixerWeights {
     /// Entities as the mixer's encoder sees them.
     pub entities: Entities,
-    /// The agents' queries over them, (R, a).
+    /// The agents' queries over them, (R, heads · h).
     pub queries: Var,
     /// `w1`'s output, signed, (R, x).
     pub w1: Var,
@@ -62,11 +61,13 @@ impl Mixer {
         let layers =
             [("mixer.w1_hidden", y), ("mixer.w2_hidden", y), ("mixer.b2_hidden", x), ("mixer.b1", x)];
         let hyper = Linear::side_by_side(layout, h + context, &layers);
+        // No ReLU stands between the two.
+        let hyper = layout.derived().chain(&out, &hyper);
         let w1_hidden = hyper.output_rows(0..y);
         let w1 = Linear::new(layout, "mixer.w1", y, x);
         let w2 = Linear::new(layout, "mixer.w2", y, x);
         let b2 = Linear::new(layout, "mixer.b2", x, 1);
-        Self { encoder, out, hyper, w1_hidden, w1, w2, b2 }
+        Self { encoder, hyper, w1_hidden, w1, w2, b2 }
     }
 
     /// All that does not depend on utilities: the weights that mix them, from `representation` (R, h_z) if there is
@@ -80,17 +81,16 @@ impl Mixer {
         let (x, y) = (self.w1.outputs, self.w1.inputs);
         let entities = self.encoder.entities(tape, rows);
         let queries = self.encoder.queries(tape, rows, entities);
-        let attended =
-            tape.attend(&self.encoder.attention, queries, entities.key_values, &rows.groups, Visible::All);
-        let context = tape.linear(&self.out, attended);
-        let parts: Vec<Var> = [context].into_iter().chain(representation).collect();
+        let attended = tape.reserve(queries.rows, self.encoder.attention_dim());
+        self.encoder.attend(tape, rows, (queries, entities), &[Visible::All], attended);
+        let parts: Vec<Var> = [attended].into_iter().chain(representation).collect();
         let hyper = tape.linear_of(&self.hyper, &parts, 0..2 * y + x);
         let w1 = tape.linear(&self.w1, hyper.columns(0..y));
         // A mean and a linear layer commute.
         let means = tape.mean_over_members(hyper.columns(y..2 * y + 2 * x), &rows.groups);
         let w2 = tape.linear(&self.w2, means.columns(0..y));
         let b2 = tape.linear(&self.b2, means.columns(y..y + x));
-        for var in [entities.x, entities.key_values, queries, attended, context, hyper] {
+        for var in [entities.x, entities.values, queries, attended, hyper] {
             tape.free(var);
         }
         MixerWeights { entities, queries, w1, b1: means.columns(y + x..y + 2 * x), w2, b2 }
@@ -107,10 +107,8 @@ impl Mixer {
     ) -> MixerWeights {
         let MixerWeights { entities, queries, .. } = *weights;
         let attended = tape.reserve(queries.rows * masks.len(), self.encoder.attention_dim());
-        let attention = &self.encoder.attention;
-        tape.attend_into(attention, queries, entities.key_values, &rows.groups, masks, attended);
-        let context = tape.linear(&self.out, attended);
-        let hidden = tape.linear_relu(&self.w1_hidden, context);
+        self.encoder.attend(tape, rows, (queries, entities), masks, attended);
+        let hidden = tape.linear_relu(&self.w1_hidden, attended);
         MixerWeights { w1: tape.linear(&self.w1, hidden), ..*weights }
     }
 

@@ -16,6 +16,7 @@ use std::{mem, sync::Arc};
 /// A policy of a method's networks. Holds only what acting needs.
 pub struct ValueActing<N: ValueNetwork> {
     network: Arc<N>,
+    /// With what is derived from them.
     params: Vec<f32>,
     tables: Tables,
     /// What the agents of each slot's running episode remember.
@@ -68,8 +69,7 @@ impl<N: ValueNetwork> ValueActing<N> {
 impl<N: ValueNetwork> Actor for ValueActing<N> {
     fn set_params(&mut self, params: &[f32]) {
         assert_eq!(params.len(), self.network.parts().acting.len(), "the parameters that acting needs");
-        self.params.clear();
-        self.params.extend_from_slice(params);
+        self.network.parts().layout.derived().extend(params, &mut self.params);
         self.tables = self.network.tables(&self.params);
     }
 }

@@ -232,7 +232,10 @@ pub struct TdLearner<N: ValueNetwork> {
     pub target: Vec<f32>,
     /// The optimiser and its moments.
     pub optimizer: Optimizer,
+    /// Extended by those of derived layers.
     grads: Vec<f32>,
+    /// Online and target parameters, with what is derived from them.
+    extended: [Vec<f32>; 2],
     rows: Vec<Rows>,
     shards: Vec<Shard>,
     pairs: Pairs,
@@ -259,7 +262,8 @@ impl<N: ValueNetwork> TdLearner<N> {
         Ok(Self {
             target: params[parts.target.clone()].to_vec(),
             optimizer: Optimizer::new(config.optimizer, config.lr, params.len()),
-            grads: vec![0.0; params.len()],
+            grads: vec![0.0; parts.layout.derived().len()],
+            extended: Default::default(),
             rows: (0..shards).map(|_| Rows::default()).collect(),
             shards: (0..shards).map(|_| Shard::default()).collect(),
             pairs: Pairs::default(),
@@ -274,7 +278,7 @@ impl<N: ValueNetwork> TdLearner<N> {
 
     /// The gradients that [`TdLearner::gradients`] left, in the layout's order.
     pub fn grads(&self) -> &[f32] {
-        &self.grads
+        &self.grads[..self.params.len()]
     }
 
     /// Losses and gradients of a batch, without a step: the measures' values. `pairing` makes a permutation of so many
@@ -297,13 +301,15 @@ impl<N: ValueNetwork> TdLearner<N> {
         pairing: impl FnOnce(usize) -> Vec<usize> + Send,
         see: impl Fn(&SeenShard<'_>) + Sync,
     ) -> Vec<f64> {
-        let Self { network, config, pool, params, target, grads, rows, shards, pairs, workers, .. } = self;
+        let Self { network, config, pool, grads, extended, rows, shards, pairs, workers, .. } = self;
         let (network, workers, count) = (&**network, &*workers, shards.len());
-        let tables = [network.tables(params), network.tables(target)];
-        let online = Weights { params, tables: &tables[0] };
-        let target = Weights { params: target, tables: &tables[1] };
+        let (derived, parameters) = (network.parts().layout.derived(), self.params.len());
+        derived.extend(&self.params, &mut extended[0]);
+        derived.extend(&self.target, &mut extended[1]);
+        let tables = extended.each_ref().map(|params| network.tables(params));
+        let [online, target] = [0, 1].map(|at| Weights { params: &extended[at], tables: &tables[at] });
         let update = Update { network, online, target, gamma: config.gamma, totals: totals(batch) };
-        let (sums, square) = pool.install(|| {
+        let sums = pool.install(|| {
             rows.par_iter_mut().zip(&mut *shards).enumerate().for_each(|(index, (rows, shard))| {
                 rows.fill_from_episodes(&batch[part(batch.len(), count, index)], config.terminal_states);
                 shard.clear(online.params.len());
@@ -327,8 +333,11 @@ impl<N: ValueNetwork> TdLearner<N> {
                     represented.map_or_else(|| mem::take(&mut shard.stock), Represented::into_stock);
             }
             let parts: Vec<&[f32]> = shards.iter().map(|shard| &shard.grads[..]).collect();
-            (sums, tree_sum(grads, &parts))
+            tree_sum(grads, &parts);
+            sums
         });
+        derived.backward(online.params, grads);
+        let grad_norm = optimizer::sum_of_squares(&grads[..parameters]).sqrt();
         let filled = update.totals.filled as f64;
         let [td, contrastive, q_total, target] = sums.common;
         let mut measures = vec![td / filled];
@@ -336,14 +345,15 @@ impl<N: ValueNetwork> TdLearner<N> {
             measures.push(contrastive);
         }
         measures.extend(network.losses(&sums.own));
-        measures.extend([square.sqrt(), q_total / filled, target / filled]);
+        measures.extend([grad_norm, q_total / filled, target / filled]);
         measures
     }
 
     /// One step of the optimiser along the gradients that [`TdLearner::gradients`] left, which are of this norm.
     pub fn apply(&mut self, grad_norm: f64) {
         let scale = optimizer::clip_scale(grad_norm, self.config.grad_norm_clip);
-        self.optimizer.step(&mut self.params, &self.grads, scale);
+        let parameters = self.params.len();
+        self.optimizer.step(&mut self.params, &self.grads[..parameters], scale);
     }
 
     /// Copies the online weights into the target network.

@@ -10,7 +10,7 @@ use crate::{
     learner::Measure,
     method,
 };
-use rit_nn::{Gru, LayoutBuilder, Linear, Tape, attention::Visible};
+use rit_nn::{Gru, Layout, LayoutBuilder, Linear, Tape, attention::Visible};
 
 /// The utility network, and all else in [`ValueParts`].
 #[derive(Clone, Debug)]
@@ -36,8 +36,13 @@ impl Recurrent {
     /// Declares the networks. Parameters lie in the order utility, task encoder, mixer, discriminator, so what acting
     /// needs and what the target network covers are the first ones.
     pub fn new(config: &ModelConfig) -> Self {
+        let (mut network, layout) = Layout::of(|layout| Self::declare(config, layout));
+        network.parts.layout = layout;
+        network
+    }
+
+    fn declare(config: &ModelConfig, layout: &mut LayoutBuilder) -> Self {
         let facts = config.method.facts();
-        let layout = &mut LayoutBuilder::default();
         let (h, a) = (config.hidden_dim, config.attention_dim);
         let new_encoder = |layout: &mut LayoutBuilder, name| {
             Encoder::new(layout, name, config.entity_dim, h, a, config.n_heads)
@@ -63,9 +68,8 @@ impl Recurrent {
         });
         let target = 0..layout.len();
         let task = task_encoder.map(|task_encoder| (task_encoder, Discriminator::new(layout, z, h)));
-        let layout = std::mem::take(layout).finish();
-        let parts =
-            ValueParts { layout, acting, target, n_actions: config.n_actions, memory_dim: h, mixer, task };
+        let (layout, n_actions) = (Layout::default(), config.n_actions);
+        let parts = ValueParts { layout, acting, target, n_actions, memory_dim: h, mixer, task };
         Self { parts, beside, encoder, gru, output }
     }
 }

@@ -15,7 +15,7 @@ use crate::{
 use rand::RngExt as _;
 use rit_episode::{Episode, Stream};
 use rit_nn::{
-    Gru, LayoutBuilder, Linear, Tape, Var, View,
+    Gru, Layout, LayoutBuilder, Linear, Tape, Var, View,
     attention::{Group, Visible},
 };
 
@@ -57,7 +57,7 @@ pub struct Imagined {
     together: [Vec<u8>; 2],
     /// First row of each time where every agent has [`PASSES`] rows, then how many there are.
     times: Vec<usize>,
-    /// The entity row of each of those rows' agent.
+    /// The distinct entity that each of those rows' agent is.
     own: Vec<usize>,
     /// Of those rows, the ones of each pass.
     of_pass: [Vec<usize>; PASSES],
@@ -72,7 +72,12 @@ pub struct Imagined {
 impl Refil {
     /// Declares the networks: utility, then mixer.
     pub fn new(config: &ModelConfig) -> Self {
-        let layout = &mut LayoutBuilder::default();
+        let (mut network, layout) = Layout::of(|layout| Self::declare(config, layout));
+        network.parts.layout = layout;
+        network
+    }
+
+    fn declare(config: &ModelConfig, layout: &mut LayoutBuilder) -> Self {
         let (h, a) = (config.hidden_dim, config.attention_dim);
         let beside = config.encoder == method::Encoder::Beside;
         let encoder = Encoder::new(layout, "utility", config.entity_dim, h, a, config.n_heads);
@@ -82,7 +87,7 @@ impl Refil {
         let of_mixer = Encoder::new(layout, "mixer", config.entity_dim, h, a, config.n_heads);
         let mixer = Mixer::new(layout, of_mixer, 0, config.mixing_embed_dim, config.hypernet_embed_dim);
         let target = 0..layout.len();
-        let layout = std::mem::take(layout).finish();
+        let layout = Layout::default();
         let parts = ValueParts {
             layout,
             acting,
@@ -95,7 +100,7 @@ impl Refil {
         Self { parts, mixer, beside, encoder, gru, head, imagined_weight: config.imagined_weight }
     }
 
-    /// What the GRU reads of each pass, `own` being the entity rows of its agents.
+    /// What the GRU reads of each pass, `own` being the distinct entities that its agents are.
     fn encode<'a>(
         &self,
         tape: &mut Tape<'a>,
@@ -144,7 +149,7 @@ impl ValueNetwork for Refil {
         }
         let mut inputs = Imagined {
             times: rows.agent_times.iter().map(|row| PASSES * row).collect(),
-            own: rows.agent_entities.iter().flat_map(|&row| [row; PASSES]).collect(),
+            own: rows.agent_distinct.iter().flat_map(|&row| [row; PASSES]).collect(),
             of_pass: [0, 1, 2].map(|pass| (0..rows.agent_rows()).map(|row| PASSES * row + pass).collect()),
             imagined: (0..rows.agent_rows()).flat_map(|row| [PASSES * row + 1, PASSES * row + 2]).collect(),
             actions: rows.actions.iter().flat_map(|&action| [action; PASSES]).collect(),
@@ -178,7 +183,7 @@ impl ValueNetwork for Refil {
         let masks = [real, Visible::Where(within), Visible::Where(across)];
         let (masks, own, times) = match pass.role {
             Role::Online => (&masks[..], &inputs.own, &inputs.times),
-            Role::Target | Role::Acting => (&masks[..1], &rows.agent_entities, &rows.agent_times),
+            Role::Target | Role::Acting => (&masks[..1], &rows.agent_distinct, &rows.agent_times),
         };
         let encoded = self.encode(tape, rows, own, masks);
         let gates = tape.product_of(&self.gru.input, 0, &[encoded]);

@@ -12,7 +12,7 @@ use crate::{
 use losses::Dissimilarity;
 use rit_episode::{Episode, Rng, Stream, Turn};
 use rit_nn::{
-    Generated, Gru, LayerNorm, LayoutBuilder, Linear, Tape, Var, View, attention::Visible,
+    Generated, Gru, LayerNorm, Layout, LayoutBuilder, Linear, Tape, Var, View, attention::Visible,
     random::fill_standard_normal,
 };
 
@@ -74,7 +74,12 @@ pub struct Roles {
 impl Roma {
     /// Declares the networks: utility and role encoder, mixer, then what only losses need.
     pub fn new(config: &ModelConfig) -> Self {
-        let layout = &mut LayoutBuilder::default();
+        let (mut network, layout) = Layout::of(|layout| Self::declare(config, layout));
+        network.parts.layout = layout;
+        network
+    }
+
+    fn declare(config: &ModelConfig, layout: &mut LayoutBuilder) -> Self {
         let (h, a, d, roles) = (config.hidden_dim, config.attention_dim, config.entity_dim, config.role);
         let (l, r) = (roles.dim, roles.hidden_dim);
         let beside = config.encoder == method::Encoder::Beside;
@@ -94,7 +99,7 @@ impl Roma {
         let posterior = GaussianHead::new(layout, "role_posterior", h + width, r, l, roles.variance_floor);
         let dissimilarity = Dissimilarity::new(layout, l, r);
         let parts = ValueParts {
-            layout: std::mem::take(layout).finish(),
+            layout: Layout::default(),
             acting,
             target,
             n_actions: config.n_actions,

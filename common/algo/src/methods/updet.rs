@@ -7,7 +7,7 @@ use crate::{
     learner::Measure,
     method::Mixing,
 };
-use rit_nn::{HiddenToken, LayoutBuilder, Linear, Tape, attention::Visible, hidden_token::Places};
+use rit_nn::{HiddenToken, Layout, LayoutBuilder, Linear, Tape, attention::Visible, hidden_token::Places};
 
 /// The utility network, and all else in [`ValueParts`].
 #[derive(Clone, Debug)]
@@ -23,7 +23,12 @@ pub struct Updet {
 impl Updet {
     /// Declares the networks: utility, then mixer.
     pub fn new(config: &ModelConfig) -> Self {
-        let layout = &mut LayoutBuilder::default();
+        let (mut network, layout) = Layout::of(|layout| Self::declare(config, layout));
+        network.parts.layout = layout;
+        network
+    }
+
+    fn declare(config: &ModelConfig, layout: &mut LayoutBuilder) -> Self {
         let (h, a) = (config.hidden_dim, config.attention_dim);
         let embed = Linear::new(layout, "utility.embed", config.entity_dim, h);
         let block = HiddenToken::new(layout, "utility", h, a, config.n_heads, config.feedforward_dim);
@@ -34,7 +39,7 @@ impl Updet {
             Mixer::new(layout, encoder, 0, config.mixing_embed_dim, config.hypernet_embed_dim)
         });
         let target = 0..layout.len();
-        let layout = std::mem::take(layout).finish();
+        let layout = Layout::default();
         let n_actions = config.n_actions;
         let parts = ValueParts { layout, acting, target, n_actions, memory_dim: h, mixer, task: None };
         Self { parts, embed, block, head }
