@@ -15,7 +15,9 @@ pub use scripts::CombatScript;
 pub use team::{CombatSet, Team, TeamError};
 pub use unit::{StatsVersion, UnitType};
 
-use crate::{Environment, EnvironmentError, FailureKind, Spec, Step};
+use crate::{
+    BodyKind, Environment, EnvironmentError, FailureKind, Scene, SceneBody, SceneLink, SceneUnit, Spec, Step,
+};
 use rand::{RngExt as _, SeedableRng as _};
 use rit_episode::{Action, Observation, Rng};
 use serde::{Deserialize, Serialize};
@@ -67,7 +69,7 @@ impl Combat {
             n_actions: set.n_actions(),
             steps_max: set.steps_max(),
             has_wins: true,
-            has_scenes: false,
+            has_scenes: true,
             is_reproducible: true,
         }
     }
@@ -170,10 +172,44 @@ impl Environment for Combat {
         if !self.options.mirror {
             self.give_orders(actions);
         }
+        self.world.forget_links();
         for _ in 0..TICKS_PER_STEP {
             self.world.tick();
         }
         self.look();
         Ok(self.translation.advance(&self.units))
+    }
+
+    fn scene(&self) -> Option<Scene> {
+        // Units of the world by the number that agents and features know them by.
+        let units: Vec<usize> = [Side::Ally, Side::Enemy]
+            .into_iter()
+            .flat_map(|side| self.translation.unit_tags(side))
+            .map(|tag| tag as usize)
+            .collect();
+        let body = |&unit: &usize| {
+            let (stats, [x, y]) = (self.world.stats(unit), self.world.position(unit));
+            let share = |left: f64, most: f64| (left / most) as f32;
+            SceneBody {
+                kind: match self.world.side(unit) {
+                    Side::Ally => BodyKind::Agent,
+                    Side::Enemy => BodyKind::Enemy,
+                },
+                x: x as f32,
+                y: y as f32,
+                radius: stats.radius as f32,
+                unit: Some(SceneUnit {
+                    letter: self.world.kind(unit).letter(),
+                    health: share(self.world.health(unit), stats.health),
+                    shield: (stats.shield > 0.0).then(|| share(self.world.shield(unit), stats.shield)),
+                }),
+            }
+        };
+        let number = |unit: usize| units.iter().position(|&other| other == unit);
+        let links =
+            self.world.links().iter().filter_map(|&(from, to, kind)| {
+                Some(SceneLink { from: number(from)?, to: number(to)?, kind })
+            });
+        Some(Scene { bodies: units.iter().map(body).collect(), links: links.collect() })
     }
 }

@@ -106,6 +106,8 @@ pub enum BodyKind {
     Landmark,
     /// A prey.
     Prey,
+    /// A unit of the opponent's.
+    Enemy,
 }
 
 /// One body of a [`Scene`].
@@ -119,6 +121,39 @@ pub struct SceneBody {
     pub y: f32,
     /// Its size.
     pub radius: f32,
+    /// What else is shown of a unit in combat.
+    pub unit: Option<SceneUnit>,
+}
+
+/// A unit in combat.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SceneUnit {
+    /// Its type's letter.
+    pub letter: char,
+    /// Share of its health that is left; 0 for the dead.
+    pub health: f32,
+    /// Share of its shield that is left; `None` for units without.
+    pub shield: Option<f32>,
+}
+
+/// What one body did to another in the step before a scene.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LinkKind {
+    /// It attacked.
+    Attack,
+    /// It healed.
+    Heal,
+}
+
+/// One body that did something to another.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SceneLink {
+    /// Index of the body that acted.
+    pub from: usize,
+    /// Index of the other.
+    pub to: usize,
+    /// What it did.
+    pub kind: LinkKind,
 }
 
 /// What can be drawn of a state: every entity, in the environment's order.
@@ -126,6 +161,8 @@ pub struct SceneBody {
 pub struct Scene {
     /// The entities.
     pub bodies: Vec<SceneBody>,
+    /// What they did to each other in the step before.
+    pub links: Vec<SceneLink>,
 }
 
 /// One task's world: real agents and entities only, agents in an order of its own.

@@ -18,7 +18,8 @@ mod task_set;
 mod unknown_name;
 
 pub use environment::{
-    BodyKind, Environment, EnvironmentError, EnvironmentOptions, FailureKind, Scene, SceneBody, Spec, Step,
+    BodyKind, Environment, EnvironmentError, EnvironmentOptions, FailureKind, LinkKind, Scene, SceneBody,
+    SceneLink, SceneUnit, Spec, Step,
 };
 pub use scripts::{Script, UnfitScript};
 pub use seated::Seated;

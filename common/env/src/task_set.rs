@@ -2,11 +2,11 @@
 
 use crate::{
     Environment, EnvironmentOptions, Spec, UnknownName,
-    combat::{Combat, CombatSet, Team, TeamError},
+    combat::{Combat, CombatSet, Team, TeamError, translation::Translation},
     matrix_game::MatrixGame,
-    particle::{CooperativeNavigation, PredatorPrey, PredatorPreyReward},
+    particle::{CooperativeNavigation, DIRECTIONS, PredatorPrey, PredatorPreyReward},
 };
-use rit_episode::{Dims, wire::TaskSize};
+use rit_episode::{Action, Dims, wire::TaskSize};
 use serde::{Deserialize, Serialize};
 use std::{fmt, str::FromStr};
 
@@ -242,6 +242,17 @@ impl Task {
             Self::CooperativeNavigation { n } => CooperativeNavigation::spec(n),
             Self::PredatorPrey { predators, prey, .. } => PredatorPrey::spec(predators, prey),
             Self::Combat { set, allies, enemies } => Combat::spec(set, [allies, enemies]),
+        }
+    }
+
+    /// Where an action pushes or walks its agent, as a direction of the plane; `None` where entities have no places.
+    pub fn direction(self, action: Action) -> Option<[f32; 2]> {
+        match self {
+            Self::MatrixGame { .. } => None,
+            Self::CooperativeNavigation { .. } | Self::PredatorPrey { .. } => {
+                DIRECTIONS.get(usize::from(action)).copied()
+            }
+            Self::Combat { .. } => Some(Translation::direction(action)),
         }
     }
 

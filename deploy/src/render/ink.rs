@@ -56,11 +56,20 @@ pub const ACTION: Ink = Ink::new(0, 51, 84);
 /// What a step earned. Bluish green, of the same palette.
 pub const REWARD: Ink = Ink::new(0, 158, 115);
 
+/// What is left of a unit's health.
+pub const HEALTH: Ink = Ink::new(0, 158, 115);
+/// What is left of a unit's shield.
+pub const SHIELD: Ink = Ink::new(86, 180, 233);
+/// Behind both, and what is lost of them.
+pub const LOST: Ink = Ink::new(60, 60, 60);
+/// An attack.
+pub const ATTACK: Ink = Ink::new(230, 159, 0);
+
 /// The colour of a body.
 pub const fn body(kind: BodyKind) -> Ink {
     match kind {
         BodyKind::Agent => Ink::new(0, 114, 178),
         BodyKind::Landmark => Ink::new(90, 90, 88),
-        BodyKind::Prey => Ink::new(213, 94, 0),
+        BodyKind::Prey | BodyKind::Enemy => Ink::new(213, 94, 0),
     }
 }

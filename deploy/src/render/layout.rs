@@ -6,6 +6,7 @@ use super::{
     plot::{self, Plot},
     recording::{Film, Recording},
 };
+use rit_env::Task;
 
 /// Width and height of one frame of an animation.
 pub const FRAME: [u32; 2] = [520, 626];
@@ -149,13 +150,17 @@ fn heading(canvas: &mut dyn Canvas, film: &Film, [left, y]: Point) {
 /// What the numbers and the colours are, that of the rewards among them where those are drawn.
 fn legend(canvas: &mut dyn Canvas, film: &Film, [left, y]: Point, right: f32, rewards: bool) {
     let kinds = film.kinds().map(|kind| (film.name_of(kind), ink::body(kind)));
+    let fights = matches!(film.task, Task::Combat { .. });
+    let combat = [("attack", ink::ATTACK), ("health, healing", ink::HEALTH), ("shield", ink::SHIELD)];
+    let combat = combat.into_iter().filter(|_| fights);
     let mut x = left;
-    for (name, ink) in kinds.chain(rewards.then_some(("reward", ink::REWARD))) {
+    for (name, ink) in kinds.chain(combat).chain(rewards.then_some(("reward", ink::REWARD))) {
         canvas.disc([x + 5.0, y], 5.0, ink);
         write(canvas, [x + 15.0, y], Align::Left, Font::Small, ink::WORDS, name);
         x += 15.0 + (name.len() as f32 + 2.0) * Font::Small.advance();
     }
-    write(canvas, [right, y], Align::Right, Font::Small, ink::QUIET, "number: decision order");
+    let words = if fights { "number: order" } else { "number: decision order" };
+    write(canvas, [right, y], Align::Right, Font::Small, ink::QUIET, words);
 }
 
 fn write(canvas: &mut dyn Canvas, at: Point, align: Align, font: Font, ink: Ink, words: &str) {

@@ -85,7 +85,7 @@ fn record(options: &RenderOptions) -> Result<Film, Failure> {
         )));
     }
     let pairs = scenes.into_iter().zip(episodes);
-    let episodes = pairs.map(|(scenes, episode)| Recording { scenes, episode }).collect();
+    let episodes = pairs.map(|(scenes, episode)| Recording { task, scenes, episode }).collect();
     Ok(Film { task, policy: player.name, episodes })
 }
 

@@ -6,7 +6,7 @@ use super::{
     recording::Recording,
     view::View,
 };
-use rit_env::{BodyKind, SceneBody};
+use rit_env::{BodyKind, LinkKind, SceneBody, SceneUnit};
 
 /// Steps after which a trail has faded.
 const TRAIL: usize = 12;
@@ -14,6 +14,10 @@ const TRAIL: usize = 12;
 const BODY: f32 = 0.88;
 /// Smallest disc that is still seen under a number.
 const ROOM_FOR_NUMBER: f32 = 6.5;
+/// How much is still seen of a unit that is dead, right after it died; it fades over [`TRAIL`] steps.
+const DEAD: f32 = 0.45;
+/// Height of a bar of health or shield.
+const VITALS: f32 = 3.0;
 /// Share of its step that a bar of reward is wide.
 const BAR: f32 = 0.7;
 
@@ -65,8 +69,10 @@ impl<'a> Plot<'a> {
             let age = (step - 1 - from) as f32 / TRAIL as f32;
             self.trail(canvas, from, 0.65 * (1.0 - age));
         }
+        self.links(canvas, step);
         self.bodies(canvas, step);
-        for (agent, body) in self.agents(step) {
+        self.vitals(canvas, step);
+        for (agent, body) in self.agents(step).filter(|(_, body)| is_alive(body)) {
             if let Some(push) = self.recording.push(agent, step) {
                 self.action(canvas, body, push);
             }
@@ -108,9 +114,60 @@ impl<'a> Plot<'a> {
         bodies.sort_by(|a, b| b.radius.total_cmp(&a.radius));
         for body in bodies {
             let (place, radius) = (self.place(body), self.view.length(body.radius));
+            if !is_alive(body) {
+                continue;
+            }
             canvas.disc(place, radius, ink::body(body.kind).at(BODY));
             // Keeps bodies of one colour apart.
             canvas.ring(place, radius, 1.2, ink::WHITE.at(0.9));
+        }
+        for (index, body) in self.recording.scenes[step].bodies.iter().enumerate() {
+            if is_alive(body) {
+                continue;
+            }
+            let scenes = &self.recording.scenes[..=step];
+            let died = scenes.iter().position(|scene| !is_alive(&scene.bodies[index])).unwrap_or(step);
+            let age = (step - died) as f32 / TRAIL as f32;
+            let ink = ink::body(body.kind).at(DEAD * (1.0 - age).max(0.25));
+            let ([x, y], radius) = (self.place(body), self.view.length(body.radius));
+            for aside in [-radius, radius] {
+                canvas.line([x - radius, y - aside], [x + radius, y + aside], 1.6, ink);
+            }
+        }
+    }
+
+    /// Attacks and heals of the step before.
+    fn links(&self, canvas: &mut dyn Canvas, step: usize) {
+        let scene = &self.recording.scenes[step];
+        for link in &scene.links {
+            let (Some(from), Some(to)) = (scene.bodies.get(link.from), scene.bodies.get(link.to)) else {
+                continue;
+            };
+            let (ink, width) = match link.kind {
+                LinkKind::Attack => (ink::ATTACK.at(0.8), 1.4),
+                LinkKind::Heal => (ink::HEALTH.at(0.9), 2.4),
+            };
+            canvas.line(self.place(from), self.place(to), width, ink);
+        }
+    }
+
+    /// Bars of health and shield above each living unit.
+    fn vitals(&self, canvas: &mut dyn Canvas, step: usize) {
+        for body in &self.recording.scenes[step].bodies {
+            let Some(SceneUnit { health, shield, .. }) = body.unit else { continue };
+            if health <= 0.0 {
+                continue;
+            }
+            let ([x, y], radius) = (self.place(body), self.view.length(body.radius));
+            let width = (2.0 * radius).max(12.0);
+            let mut top = y - radius - 2.0 - VITALS;
+            for (share, ink) in [(Some(health), ink::HEALTH), (shield, ink::SHIELD)] {
+                let Some(share) = share else { continue };
+                let left = x - width / 2.0;
+                canvas.rectangle([left, top], [width, VITALS], ink::LOST.at(0.35));
+                canvas.rectangle([left, top], [width * share, VITALS], ink);
+                top -= VITALS + 1.0;
+            }
         }
     }
 
@@ -133,17 +190,22 @@ impl<'a> Plot<'a> {
         canvas.triangle(corners, ink::ACTION);
     }
 
-    /// Each agent's place in the decision order: on it, or beside it where that would hide it.
+    /// Each agent's place in the decision order, and each unit's type: on it, or beside it where that would hide it.
     fn numbers(&self, canvas: &mut dyn Canvas, step: usize) {
-        for (agent, body) in self.agents(step) {
-            let Some(number) = self.recording.place(agent) else { continue };
+        for (index, body) in self.recording.scenes[step].bodies.iter().enumerate() {
+            let number = (body.kind == BodyKind::Agent).then(|| self.recording.place(index)).flatten();
+            let number = number.map_or_else(String::new, |number| number.to_string());
+            let letter = body.unit.map_or_else(String::new, |unit| unit.letter.to_string());
+            if !is_alive(body) || (number.is_empty() && letter.is_empty()) {
+                continue;
+            }
             let ([x, y], radius) = (self.place(body), self.view.length(body.radius));
             let (at, ink, rim) = if radius >= ROOM_FOR_NUMBER {
                 ([x, y], ink::WHITE, ink::ACTION)
             } else {
                 ([x + radius + 5.0, y - radius - 5.0], ink::ACTION, ink::WHITE)
             };
-            let words = &number.to_string();
+            let words = &(number + &letter);
             canvas.text(Text { at, align: Align::Middle, font: Font::SmallBold, ink, rim: Some(rim), words });
         }
     }
@@ -187,6 +249,11 @@ pub fn rewards(
         );
     }
     canvas.line([left, zero], [left + size[0], zero], 1.0, ink::FRAME);
+}
+
+/// Whether a body takes part: only units die.
+fn is_alive(body: &SceneBody) -> bool {
+    body.unit.is_none_or(|unit| unit.health > 0.0)
 }
 
 fn moving(bodies: &[SceneBody]) -> impl Iterator<Item = &SceneBody> {

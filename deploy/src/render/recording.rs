@@ -1,6 +1,6 @@
 //! What is kept of episodes that are to be drawn.
 
-use rit_env::{BodyKind, Scene, Task, particle::DIRECTIONS};
+use rit_env::{BodyKind, Scene, Task};
 use rit_episode::Episode;
 
 /// Episodes of one task by one policy.
@@ -18,17 +18,19 @@ impl Film {
     pub fn name_of(&self, kind: BodyKind) -> &'static str {
         match (kind, self.task) {
             (BodyKind::Agent, Task::PredatorPrey { .. }) => "predator",
+            (BodyKind::Agent, Task::Combat { .. }) => "ally",
             (BodyKind::Agent, _) => "agent",
             (BodyKind::Landmark, Task::PredatorPrey { .. }) => "obstacle",
             (BodyKind::Landmark, _) => "landmark",
             (BodyKind::Prey, _) => "prey",
+            (BodyKind::Enemy, _) => "enemy",
         }
     }
 
     /// The kinds of body there are.
     pub fn kinds(&self) -> impl Iterator<Item = BodyKind> {
         let first = self.episodes.first().and_then(|episode| episode.scenes.first());
-        [BodyKind::Agent, BodyKind::Landmark, BodyKind::Prey]
+        [BodyKind::Agent, BodyKind::Landmark, BodyKind::Prey, BodyKind::Enemy]
             .into_iter()
             .filter(move |&kind| first.is_some_and(|scene| scene.bodies.iter().any(|body| body.kind == kind)))
     }
@@ -36,6 +38,8 @@ impl Film {
 
 /// One episode, with where everything was.
 pub struct Recording {
+    /// What was played.
+    pub task: Task,
     /// The scene before each step, and after the last: one more than there are steps.
     pub scenes: Vec<Scene>,
     /// What was done and earned.
@@ -64,11 +68,11 @@ impl Recording {
         order.iter().position(|&other| usize::from(other) == agent).map(|row| row + 1)
     }
 
-    /// Where the agent's action of a step pushed it; `None` before the first step.
+    /// Where the agent's action of a step pushed it or sent it; `None` before the first step.
     pub fn push(&self, agent: usize, step: usize) -> Option<[f32; 2]> {
         let row = self.place(agent)? - 1;
         let at = step.checked_sub(1)? * self.episode.n_agents + row;
-        DIRECTIONS.get(usize::from(*self.episode.actions.get(at)?)).copied()
+        self.task.direction(*self.episode.actions.get(at)?)
     }
 }
 
@@ -81,7 +85,7 @@ pub mod tests {
     /// Two agents, of whom the second decides first, a landmark and a prey; two steps, in which everything
     /// that moves goes by `speed` along x.
     pub fn film(speed: f32) -> Film {
-        let body = |kind, x, y, radius| SceneBody { kind, x, y, radius };
+        let body = |kind, x, y, radius| SceneBody { kind, x, y, radius, unit: None };
         let scene = |time: f32| Scene {
             bodies: vec![
                 body(BodyKind::Agent, time * speed, 0.0, 0.15),
@@ -89,6 +93,7 @@ pub mod tests {
                 body(BodyKind::Landmark, -0.5, 0.5, 0.05),
                 body(BodyKind::Prey, time * speed, -0.5, 0.05),
             ],
+            links: Vec::new(),
         };
         let episode = Episode {
             number: 0,
@@ -106,10 +111,11 @@ pub mod tests {
             end: End::Terminated,
             won: false,
         };
+        let task = Task::CooperativeNavigation { n: 2 };
         Film {
-            task: Task::CooperativeNavigation { n: 2 },
+            task,
             policy: "script:still".into(),
-            episodes: vec![Recording { scenes: [0.0, 1.0, 2.0].map(scene).to_vec(), episode }],
+            episodes: vec![Recording { task, scenes: [0.0, 1.0, 2.0].map(scene).to_vec(), episode }],
         }
     }
 

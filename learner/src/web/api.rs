@@ -14,7 +14,7 @@ use axum::{
     routing::{get, post},
 };
 use rit_algo::Regime;
-use rit_env::{BodyKind, Scene, Split, Task};
+use rit_env::{BodyKind, LinkKind, Scene, SceneLink, Split, Task};
 use rit_episode::Action;
 use rit_proto::v1;
 use serde::{Deserialize, Serialize};
@@ -204,6 +204,10 @@ struct Shown {
     won: Option<bool>,
     /// `[T + 1][m]`, agents first; empty where entities have no places.
     scenes: Vec<Vec<ShownBody>>,
+    /// `[T + 1]`: what bodies did to each other in the step before each scene.
+    links: Vec<Vec<ShownLink>>,
+    /// Where each action of the task pushes or sends its agent; empty where entities have no places.
+    pushes: Vec<[f32; 2]>,
 }
 
 #[derive(Serialize)]
@@ -212,6 +216,24 @@ struct ShownBody {
     x: f32,
     y: f32,
     radius: f32,
+    /// Of a unit in combat.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    unit: Option<ShownUnit>,
+}
+
+#[derive(Serialize)]
+struct ShownUnit {
+    letter: char,
+    health: f32,
+    shield: Option<f32>,
+}
+
+/// Who did something to whom, by index.
+#[derive(Serialize)]
+struct ShownLink {
+    from: usize,
+    to: usize,
+    heals: bool,
 }
 
 async fn watch(
@@ -227,7 +249,13 @@ async fn watch(
         }
         actions
     };
-    let has_wins = page.handle.config().environment.task_set.has_wins();
+    let config = page.handle.config();
+    let task_set = config.environment.task_set;
+    let has_wins = task_set.has_wins();
+    let pushes = task_set.task(&task).map_or_else(
+        |_| Vec::new(),
+        |task| (0..task.spec().n_actions).filter_map(|action| task.direction(action as Action)).collect(),
+    );
     Ok(Json(Shown {
         task,
         number,
@@ -236,9 +264,17 @@ async fn watch(
         actions: episode.actions.chunks_exact(episode.n_agents).map(by_agent).collect(),
         won: has_wins.then_some(episode.won),
         scenes: scenes.iter().map(shown).collect(),
+        links: scenes.iter().map(shown_links).collect(),
+        pushes,
         decision_order: episode.decision_order,
         rewards: episode.rewards,
     }))
+}
+
+fn shown_links(scene: &Scene) -> Vec<ShownLink> {
+    let link =
+        |link: &SceneLink| ShownLink { from: link.from, to: link.to, heals: link.kind == LinkKind::Heal };
+    scene.links.iter().map(link).collect()
 }
 
 fn shown(scene: &Scene) -> Vec<ShownBody> {
@@ -247,10 +283,16 @@ fn shown(scene: &Scene) -> Vec<ShownBody> {
             BodyKind::Agent => "agent",
             BodyKind::Landmark => "landmark",
             BodyKind::Prey => "prey",
+            BodyKind::Enemy => "enemy",
         },
         x: body.x,
         y: body.y,
         radius: body.radius,
+        unit: body.unit.map(|unit| ShownUnit {
+            letter: unit.letter,
+            health: unit.health,
+            shield: unit.shield,
+        }),
     });
     bodies.collect()
 }

@@ -327,6 +327,12 @@ impl Translation {
         }
     }
 
+    /// Where an action walks to, as a direction; nowhere for all that are no moves.
+    pub fn direction(action: Action) -> [f32; 2] {
+        let moves = usize::from(action).checked_sub(MOVES.start).and_then(|at| DIRECTIONS.get(at));
+        moves.map_or([0.0; 2], |direction| direction.map(|part| part as f32))
+    }
+
     /// What an agent's action asks of the game; nothing for the dead. The unit is named by its tag in the game.
     pub fn order(&self, agent: usize, action: Action) -> Option<(u64, UnitOrder)> {
         let ally = self.rows[..self.n_allies].get(agent).filter(|ally| ally.alive)?;

@@ -12,6 +12,7 @@ use super::unit::{
     ENERGY_PER_HEALTH, ENERGY_RATE, ENERGY_START, HEALING_RANGE, HEALING_RATE, Layer, SHIELD_DELAY_TICKS,
     SHIELD_RATE, Stats, StatsVersion, TICKS_PER_SECOND, UnitType,
 };
+use crate::LinkKind;
 use rit_episode::Rng;
 use weapons::{Effect, Release};
 
@@ -106,6 +107,8 @@ pub struct World {
     /// Health and shield lost to hits so far, and gained by healing and recovery, by side.
     lost: [f64; 2],
     recovered: [f64; 2],
+    /// Who attacked or healed whom since [`Self::forget_links`].
+    links: Vec<(usize, usize, LinkKind)>,
     // Work space of a tick, kept from one to the next.
     releases: Vec<Release>,
     healed: Vec<bool>,
@@ -140,6 +143,7 @@ impl World {
         self.busy_until.clear();
         self.detours.clear();
         self.effects.clear();
+        self.links.clear();
     }
 
     /// Draws attack delays from this stream from now on; without one there are none.
@@ -266,6 +270,22 @@ impl World {
     /// Health and shield that a side has regained so far.
     pub fn recovered(&self, side: Side) -> f64 {
         self.recovered[side as usize]
+    }
+
+    /// Who attacked or healed whom since [`Self::forget_links`].
+    pub fn links(&self) -> &[(usize, usize, LinkKind)] {
+        &self.links
+    }
+
+    /// Begins [`Self::links`] anew.
+    pub fn forget_links(&mut self) {
+        self.links.clear();
+    }
+
+    fn link(&mut self, from: usize, to: usize, kind: LinkKind) {
+        if !self.links.contains(&(from, to, kind)) {
+            self.links.push((from, to, kind));
+        }
     }
 
     /// Gives an order, to be followed from the next tick on. A busy unit finishes first; one that winds up breaks
@@ -413,6 +433,7 @@ impl World {
             self.recovered[self.sides[unit] as usize] += healing;
             self.energy[unit] = (self.energy[unit] - healing * ENERGY_PER_HEALTH).max(0.0);
             self.healed[patient] = true;
+            self.link(unit, patient, LinkKind::Heal);
         }
     }
 

@@ -208,8 +208,9 @@ impl World {
             x: body.position[0],
             y: body.position[1],
             radius: body.radius,
+            unit: None,
         });
-        Scene { bodies: bodies.collect() }
+        Scene { bodies: bodies.collect(), links: Vec::new() }
     }
 }
 

@@ -3,9 +3,10 @@
 import { post } from "./feed.js";
 import { byId, draw, grouped, make, short } from "./text.js";
 
-/** What each action of a particle world pushes towards: nowhere, −x, +x, −y, +y. */
-const PUSHES = [[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1]];
-const ARROWS = ["•", "←", "→", "↓", "↑"];
+/** What an action looks like: the way it pushes, or what it is called. */
+const arrow = ([dx, dy]) => (dx < 0 ? "←" : dx > 0 ? "→" : dy < 0 ? "↓" : dy > 0 ? "↑" : "•");
+/** Actions of combat from this one on are attacks and heals. */
+const FIRST_TARGET = 6;
 
 const ORDINALS = ["1st", "2nd", "3rd"];
 const ordinal = (k) => ORDINALS[k] ?? `${k + 1}th`;
@@ -131,31 +132,47 @@ export class EpisodeView {
       const trail = draw("polyline", { class: `trail ${look}`, "stroke-width": 1.6 * this.unit });
       const circle = draw("circle", { class: look, r: body.radius, "stroke-width": 1.2 * this.unit });
       const push = draw("line", { class: `push ${look}`, "stroke-width": 2.4 * this.unit });
-      const text = agent ? String(index + 1) : "";
+      const text = (agent ? String(index + 1) : "") + (body.unit?.letter ?? "");
       const roomy = body.radius > 7 * this.unit;
       const beside = { class: `label beside ${look}`, "font-size": 11 * this.unit, y: -body.radius - 4 * this.unit };
       const inside = { class: "label", "font-size": body.radius * 1.1, dy: "0.36em" };
       const label = draw("text", { ...(roomy ? inside : beside), "text-anchor": "middle" }, text);
-      const place = draw("g", {}, push, circle, label);
-      return { index, kind: body.kind, radius: body.radius, trail, place, push };
+      const bars = body.unit ? this.#buildVitals(body) : [];
+      const place = draw("g", {}, push, circle, label, ...bars.flatMap(({ back, bar }) => [back, bar]));
+      return { index, kind: body.kind, radius: body.radius, trail, place, push, bars };
     });
+    this.links = draw("g", { class: "links", "stroke-width": 1.4 * this.unit });
     const layer = (kinds) => this.bodies.filter(({ kind }) => kinds.includes(kind));
     this.svg.append(
       ...layer(["landmark"]).map(({ place }) => place),
-      ...layer(["agent", "prey"]).map(({ trail }) => trail),
-      ...layer(["prey", "agent"]).map(({ place }) => place),
+      ...layer(["agent", "prey", "enemy"]).map(({ trail }) => trail),
+      this.links,
+      ...layer(["prey", "enemy", "agent"]).map(({ place }) => place),
     );
     byId("episode-stage").replaceChildren(this.svg);
     this.table = null;
   }
 
-  /** Lines half a unit of the world apart. */
+  /** Bars of health and shield above a unit. */
+  #buildVitals({ radius, unit }) {
+    const width = Math.max(2 * radius, 12 * this.unit);
+    const height = 2.5 * this.unit;
+    const kinds = unit.shield === null ? ["health"] : ["health", "shield"];
+    return kinds.map((of, row) => {
+      const y = -radius - (row + 1) * (height + this.unit) - this.unit;
+      const shape = { x: -width / 2, y, height };
+      return { of, width, back: draw("rect", { ...shape, width, class: "lost" }), bar: draw("rect", { ...shape, width, class: of }) };
+    });
+  }
+
+  /** Lines half a unit of the world apart, or more where that would be too many. */
   #buildGrid(left, top, width, height) {
     const grid = draw("g", { class: "grid", "stroke-width": this.unit });
-    for (let x = Math.ceil(left * 2) / 2; x < left + width; x += 0.5) {
+    const pitch = [0.5, 1, 2, 5, 10].find((pitch) => width / pitch <= 16) ?? 20;
+    for (let x = Math.ceil(left / pitch) * pitch; x < left + width; x += pitch) {
       grid.append(draw("line", { x1: x, x2: x, y1: top, y2: top + height }));
     }
-    for (let y = Math.ceil(top * 2) / 2; y < top + height; y += 0.5) {
+    for (let y = Math.ceil(top / pitch) * pitch; y < top + height; y += pitch) {
       grid.append(draw("line", { x1: left, x2: left + width, y1: y, y2: y }));
     }
     this.svg.append(grid);
@@ -201,17 +218,26 @@ export class EpisodeView {
   }
 
   #placeBodies(time, step) {
-    const { scenes, actions } = this.#episode;
+    const { scenes, actions, links, pushes } = this.#episode;
     const next = Math.min(step + 1, this.steps);
     const part = time - step;
-    for (const { index, kind, radius, trail, place, push } of this.bodies) {
+    this.links.replaceChildren(
+      ...links[next].map(({ from, to, heals }) => {
+        const [a, b] = [scenes[step][from], scenes[next][to]];
+        return draw("line", { class: heals ? "heal" : "attack", x1: a.x, y1: -a.y, x2: b.x, y2: -b.y });
+      }),
+    );
+    for (const { index, kind, radius, trail, place, push, bars } of this.bodies) {
       const [from, to] = [scenes[step][index], scenes[next][index]];
       const [x, y] = [from.x + (to.x - from.x) * part, -(from.y + (to.y - from.y) * part)];
       place.setAttribute("transform", `translate(${x} ${y})`);
+      for (const { of, width, bar } of bars) bar.setAttribute("width", width * Math.max(0, to.unit[of]));
+      place.classList.toggle("dead", to.unit?.health <= 0);
+      trail.classList.toggle("dead", to.unit?.health <= 0);
       const past = scenes.slice(0, step + 1).map((scene) => `${scene[index].x},${-scene[index].y}`);
       trail.setAttribute("points", [...past, `${x},${y}`].join(" "));
       if (kind !== "agent") continue;
-      const [dx, dy] = step < this.steps ? PUSHES[actions[step][index]] : [0, 0];
+      const [dx, dy] = step < this.steps ? pushes[actions[step][index]] : [0, 0];
       const length = radius + 9 * this.unit;
       push.setAttribute("x2", dx * length);
       push.setAttribute("y2", -dy * length);
@@ -219,10 +245,13 @@ export class EpisodeView {
   }
 
   #showOrder(step) {
-    const { decision_order, actions, scenes } = this.#episode;
+    const { decision_order, actions, scenes, pushes } = this.#episode;
+    const fights = scenes.length && scenes[0][0].unit;
+    const told = (action) =>
+      !scenes.length ? matrixAction(action) : fights && action >= FIRST_TARGET ? `×${action - FIRST_TARGET}` : arrow(pushes[action]);
     const joint = actions[Math.min(step, this.steps - 1)];
     const chips = decision_order.map((agent, k) =>
-      make("li", {}, make("span", { class: "note" }, ordinal(k)), make("i", { class: `dot c${agent % 6}` }, String(agent + 1)), scenes.length ? ARROWS[joint[agent]] : matrixAction(joint[agent])),
+      make("li", {}, make("span", { class: "note" }, ordinal(k)), make("i", { class: `dot c${agent % 6}` }, String(agent + 1)), told(joint[agent])),
     );
     byId("episode-order").replaceChildren(...chips);
   }

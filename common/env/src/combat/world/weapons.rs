@@ -1,6 +1,7 @@
 //! Weapons: wind-up, release, what flies, and what a hit does.
 
 use super::{EPSILON, Layer, Order, WindUp, World, distance};
+use crate::LinkKind;
 use crate::combat::unit::{Delivery, Stats, TICKS_PER_SECOND, Weapon, ticks};
 use rand::RngExt as _;
 
@@ -110,6 +111,7 @@ impl World {
 
     fn release(&mut self, Release { from, target }: Release) {
         let Some(Weapon { delivery, .. }) = self.stats[from].weapon else { return };
+        self.link(from, target, LinkKind::Attack);
         let later = |due, what| Effect { due, from, target, what };
         match delivery {
             Delivery::Instant => self.hit(from, target),
