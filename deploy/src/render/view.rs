@@ -28,7 +28,10 @@ pub struct View {
 impl View {
     /// Shows all that ever happens, since the world has no walls.
     pub fn around(scenes: &[Scene], corner: Point, side: f32) -> Self {
-        let (mut low, mut high) = ([-AT_LEAST; 2], [AT_LEAST; 2]);
+        // Battles lie anywhere on their map; only what happens is shown of it.
+        let fights = scenes.iter().flat_map(|scene| &scene.bodies).any(|body| body.unit.is_some());
+        let at_least = if fights { f32::NEG_INFINITY } else { AT_LEAST };
+        let (mut low, mut high) = ([-at_least; 2], [at_least; 2]);
         for body in scenes.iter().flat_map(|scene| &scene.bodies) {
             let reach = body.radius + MARGIN;
             for (axis, place) in [body.x, body.y].into_iter().enumerate() {
