@@ -497,3 +497,6 @@ fn files(run_dir: &RunDir, manifest: Option<&Manifest>) -> Result<(MetricsFile, 
 pub fn evaluation_seed(config: &Config) -> RunSeed {
     config.seed.derive("evaluation", 0)
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,58 @@
+use super::*;
+use rit_algo::{Method, Model};
+use rit_config::OwnedRunDir;
+use rit_env::{
+    Script,
+    rollout::{Job, Rollout, all_rolled},
+};
+use rit_episode::Choice;
+
+/// Batches of random play, as long as the trainer takes them.
+fn batches(config: &Config, count: u64) -> Vec<Work> {
+    let size = config.algorithm.n_rollout_threads as u64;
+    let tasks = config.tasks(Split::Training);
+    let mut rollout = Rollout::new(tasks, config.environment_options(), config.seed, true);
+    let mut batch = |first: u64| {
+        let job = |number| Job { number, weights_version: 0, choice: Choice::EpsilonGreedy(1.0), task: None };
+        let jobs: Vec<Job> = (first..first + size).map(job).collect();
+        Work::Batch(all_rolled(rollout.roll(&mut Script::Random, &jobs)).unwrap())
+    };
+    (0..count).map(|index| batch(index * size)).collect()
+}
+
+/// Weights so large that no sum of them is a number. What is not finite reaches neither the weights that actors get nor a
+/// checkpoint.
+#[test]
+fn an_update_that_is_not_finite_ends_the_run_before_it_reaches_anything() {
+    for method in Method::ALL {
+        let settings = [&format!("algorithm.name={method}"), "network.hidden_dim=8", "evaluation.episodes=1"];
+        let mut settings: Vec<_> = settings.iter().map(|text| rit_config::set(text).unwrap()).collect();
+        if method.facts().regime == Regime::Replay {
+            settings.push(rit_config::set("algorithm.batch_size=2").unwrap());
+        }
+        let config = rit_config::resolve("environment.task_set = 'matrix-game'", "test", &settings).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let made = OwnedRunDir::create(&folder.path().join("run"), &config).unwrap();
+        let run_dir = made.run_dir().clone();
+        let model = Arc::new(Model::new(config.model()).unwrap());
+        let mut params = model.initial(&mut config.seed.stream(Stream::Weights, 0));
+        params.iter_mut().for_each(|weight| *weight = (*weight * 1e38).clamp(f32::MIN, f32::MAX));
+        let learner = rit_algo::learner(model, config.update(), params.clone()).unwrap();
+        let (writer, written) = mpsc::channel();
+        let (trainer, board) =
+            Trainer::new(config.clone(), run_dir, learner, None, Box::new(|_| ()), writer).unwrap();
+        let (work, queue) = mpsc::channel();
+        batches(&config, 3).into_iter().for_each(|batch| work.send(batch).unwrap());
+        let ended = trainer.run(&queue);
+        let Err(error @ TrainError::NotFinite { update: 1, .. }) = ended else {
+            panic!("{method}: {ended:?}")
+        };
+        assert!(error.to_string().contains("is not finite in update 1"), "{error}");
+        assert_eq!((board.newest().version, board.newest().to_params()), {
+            let acting = Model::new(config.model()).unwrap().acting();
+            (0, params[acting].to_vec())
+        });
+        let checkpoints = written.iter().filter(|what| matches!(what, ToWrite::Checkpoint(..)));
+        assert_eq!(checkpoints.count(), 0, "{method}");
+    }
+}
