@@ -206,7 +206,7 @@ fn status(status: &RunStatus, as_json: bool) -> Result<String, Failure> {
     }
     lines.push(format!("{:18} process {}", "learner", status.pid));
     for actor in &status.actors {
-        let (name, pid) = (&actor.name, actor.pid);
+        let (name, pid) = (report::printable(&actor.name), actor.pid);
         let on_another_host = if actor.remote { " on another host" } else { "" };
         let episodes = grouped(actor.episodes);
         lines.push(format!("{name:18} process {pid}{on_another_host}, {episodes} episodes"));

@@ -151,14 +151,9 @@ mod tests {
 
     #[test]
     fn a_filter_means_something_or_is_refused_with_what_there_is() {
-        for text in [
-            "info",
-            "DEBUG",
-            "off",
-            "rit_learner=debug",
-            "warn,rit::train=trace,h2=off",
-            "[span{a=1,b}]=info",
-        ] {
+        for text in
+            ["info", "DEBUG", "off", "rit_learner=debug", "warn,rit::train=trace,h2=off", "[span{a=1}]=info"]
+        {
             assert!(filter(text).is_ok(), "{text}");
         }
         for (text, message) in [

@@ -104,6 +104,15 @@ pub fn words(name: &str) -> String {
     name.replace('_', " ")
 }
 
+/// Text from outside, such as an actor's name, as a terminal may be shown it: on one line, no longer than a line, and
+/// without the characters that steer a terminal.
+pub fn printable(text: &str) -> String {
+    const LEN_MAX: usize = 200;
+    let shown: String =
+        text.chars().take(LEN_MAX).map(|c| if c.is_control() { '\u{fffd}' } else { c }).collect();
+    if shown.chars().count() < text.chars().count() { shown + "…" } else { shown }
+}
+
 /// A number with thin groups of three digits.
 pub fn grouped(number: u64) -> String {
     let digits = number.to_string();
@@ -138,6 +147,13 @@ mod tests {
             [0.4, 59.6, 61.0, 3700.0].map(duration),
             ["0 s", "1 min 00 s", "1 min 01 s", "1 h 01 min"]
         );
+    }
+
+    #[test]
+    fn text_from_outside_steers_no_terminal() {
+        assert_eq!(printable("actor-0"), "actor-0");
+        assert_eq!(printable("a\u{1b}[31m\nb\u{9b}c"), "a\u{fffd}[31m\u{fffd}b\u{fffd}c");
+        assert_eq!(printable(&"ä".repeat(60_000)).chars().count(), 201);
     }
 
     #[test]

@@ -35,8 +35,14 @@ fn words(error: &Error, mut arguments: impl Iterator<Item = String>) -> String {
     match error.kind() {
         ErrorKind::UnknownArgument => {
             let suggested = context(ContextKind::SuggestedArg);
-            let advice = suggested.map(|option| format!("did you mean {option}?"));
-            let advice = advice.or_else(|| key_advice(&argument, command.as_deref()));
+            let suggested = suggested.map(|option| format!("did you mean {option}?"));
+            let advice = match key_meant(&argument, command.as_deref()) {
+                // The very name of a key is no slip of another option's.
+                Some((key, is_its_name)) if is_its_name || suggested.is_none() => {
+                    Some(format!("a key is set with --set {key}=VALUE"))
+                }
+                _ => suggested,
+            };
             format!("unknown option {argument}; {}", advice.unwrap_or_else(|| format!("`{help}` lists them")))
         }
         ErrorKind::ValueValidation => {
@@ -84,14 +90,15 @@ fn option(argument: &str) -> &str {
     argument.split(' ').next().unwrap_or(argument)
 }
 
-/// How to set the key of the configuration that was meant, where the command takes any.
-fn key_advice(argument: &str, command: Option<&str>) -> Option<String> {
+/// The key of the configuration that was meant, perhaps, where the command takes any; and whether it is called so.
+fn key_meant(argument: &str, command: Option<&str>) -> Option<(String, bool)> {
     let root = Cli::command();
     let takes_keys =
         root.find_subcommand(command?)?.get_arguments().any(|option| option.get_id() == "settings");
     let name = option(argument).trim_start_matches('-');
     let key = rit_config::key_like(name).filter(|_| takes_keys)?;
-    Some(format!("a key is set with --set {key}=VALUE"))
+    let is_its_name = key.rsplit('.').next() == Some(&name.replace('-', "_"));
+    Some((key, is_its_name))
 }
 
 /// What clap says before it comes to usage and tips, in one line.

@@ -7,7 +7,7 @@ mod common;
 use common::{RunFolder, output, rit};
 use std::{
     fs::{self, OpenOptions},
-    io::{BufRead as _, BufReader, PipeWriter},
+    io::{BufRead as _, BufReader, PipeWriter, Write as _},
     path::{Path, PathBuf},
     process::{Command, Stdio},
 };
@@ -155,6 +155,20 @@ fn a_run_goes_on_when_its_reader_leaves_after_the_first_line() {
     assert!(line.contains("run directory"), "{line}");
     assert_eq!(train.wait().unwrap().code(), Some(0));
     assert!(run_dir.join("summary.json").exists());
+}
+
+#[test]
+fn a_run_goes_on_beside_a_pipe_that_is_full_and_that_nobody_reads() {
+    let (reader, mut writer) = std::io::pipe().unwrap();
+    rustix::io::ioctl_fionbio(&writer, true).unwrap();
+    while writer.write(&[b'.'; 4096]).is_ok() {}
+    // Whoever writes waits from now on.
+    rustix::io::ioctl_fionbio(&writer, false).unwrap();
+    let folder = RunFolder::new();
+    assert_eq!(train(&folder, Stdio::null(), writer.into()), Some(0));
+    let log = fs::read_to_string(folder.run_dir().join("logs/train.log")).unwrap();
+    assert!(log.contains("run directory"), "{log}");
+    drop(reader);
 }
 
 #[test]

@@ -213,7 +213,7 @@ fn what_is_asked_is_answered_and_nonsense_is_refused() {
     assert!(server.get("/metrics").body.ends_with("# EOF\n"));
     assert_eq!(server.send("GET /metrics", &[], "").status, 401);
     let log = server.get("/api/log?process=learner").json();
-    assert_eq!(log["processes"], json!(["learner", "actor-0"]));
+    assert_eq!(log["processes"], json!(["learner", "train", "actor-0"]));
     assert!(log["text"].as_str().unwrap().contains("the web page is served"));
 
     for (path, body, status, message) in [

@@ -80,7 +80,16 @@ impl Role {
 pub(crate) fn create_node(space: &RunSpace, role: Role) -> Result<Node<Service>, IceoryxError> {
     static LOG_LEVEL: Once = Once::new();
     // Below that it tells of every dead process it meets.
-    LOG_LEVEL.call_once(|| set_log_level_from_env_or(LogLevel::Error));
+    LOG_LEVEL.call_once(|| {
+        // It answers a level that it does not know by printing, which ends a process whose output cannot be written.
+        let known = ["trace", "debug", "info", "warn", "error", "fatal"];
+        let level = std::env::var("IOX2_LOG_LEVEL").map(|level| level.to_lowercase());
+        if level.is_ok_and(|level| known.contains(&level.as_str())) {
+            set_log_level_from_env_or(LogLevel::Error);
+        } else {
+            set_log_level(LogLevel::Error);
+        }
+    });
 
     let name = NodeName::new(role.name()).map_err(|error| IceoryxError::new("naming a node", error))?;
     let node = NodeBuilder::new()

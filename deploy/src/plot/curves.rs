@@ -80,18 +80,22 @@ pub fn by_kind(runs: &[Run], labels: &[String]) -> Result<Vec<Series>, Failure> 
     Ok(series.collect())
 }
 
-/// Keys whose values are not the same in all kinds.
+/// Keys whose values are not the same in all kinds. Of a key that some algorithm has not, the algorithm tells enough.
 fn differing(kinds: &[&Kind]) -> Vec<String> {
     let keys: BTreeSet<&String> = kinds.iter().flat_map(|kind| kind.keys()).collect();
     let differs = |key: &&String| kinds.iter().any(|kind| kind.get(*key) != kinds[0].get(*key));
-    keys.into_iter().filter(differs).cloned().collect()
+    let differing: Vec<String> = keys.into_iter().filter(differs).cloned().collect();
+    let (of_all, of_some): (Vec<_>, Vec<_>) =
+        differing.into_iter().partition(|key| kinds.iter().all(|kind| kind.contains_key(key)));
+    if of_all.is_empty() { of_some } else { of_all }
 }
 
-/// What sets a kind apart, in the last words of its keys: "gamma 0.9, mixing sum".
+/// What sets a kind apart, in the last words of its keys: "rit-vdn, gamma 0.9".
 fn label(kind: &Kind, differing: &[String], run: &Run) -> String {
     let word = |key: &String| {
         let name = key.rsplit('.').next().unwrap_or(key);
-        kind.get(key).map(|value| if name == "folder" { value.clone() } else { format!("{name} {value}") })
+        let speaks_for_itself = ["folder", "name"].contains(&name);
+        kind.get(key).map(|value| if speaks_for_itself { value.clone() } else { format!("{name} {value}") })
     };
     let words: Vec<_> = differing.iter().filter_map(word).collect();
     if words.is_empty() { run.name.clone() } else { words.join(", ") }
@@ -201,7 +205,7 @@ mod tests {
         let a = run_dir(folder.path(), "a", &["seed=1", EVERY], &points);
         let others = [
             ("gamma", vec!["algorithm.gamma=0.9", EVERY], "algorithm.gamma (0.99, 0.9)"),
-            ("vdn", vec!["algorithm.mixing=sum", EVERY], "algorithm.mixing (network, sum)"),
+            ("vdn", vec!["algorithm.name=rit-vdn", EVERY], "algorithm.name (rit, rit-vdn);"),
             ("interval", vec!["evaluation.every_env_steps=5"], "evaluation.every_env_steps (10, 5)"),
         ];
         for (name, settings, difference) in others {

@@ -1,7 +1,9 @@
 //! Around the supervisor: the processes, the clock, and the way to the learner.
 
 use super::{Effect, Event, Exit, Hung, Outcome, Place, Standing, Supervisor, process::Processes};
-use crate::{control, logging::LogOptions, progress::Progress, shutdown, warnings::Warnings};
+use crate::{
+    control, logging::LogOptions, progress::Progress, report::printable, shutdown, warnings::Warnings,
+};
 use rit_config::{OwnedRunDir, RunDir};
 use rit_learner::life;
 use rit_proto::{
@@ -142,7 +144,7 @@ impl Shell<'_> {
             }
             Contacted::Status(status) => {
                 for warning in self.warnings.new_of(&status) {
-                    self.progress.say(&format!("warning: {warning}"));
+                    self.progress.say(&format!("warning: {}", printable(&warning)));
                 }
                 self.progress.update(&status);
                 Event::Status(standing(&status))

@@ -1,7 +1,7 @@
 //! How a run looks on a terminal.
 
 use super::model::{Curve, Model};
-use crate::report::{duration, grouped, state, time_left, words};
+use crate::report::{duration, grouped, printable, state, time_left, words};
 use ratatui::{
     Frame,
     layout::{Constraint, Layout, Rect},
@@ -41,7 +41,8 @@ pub fn draw(frame: &mut Frame<'_>, model: &Model) {
 
 /// Something that happened, in a line.
 pub fn happening(happening: &Happening) -> String {
-    format!("{:>11}  {}", format!("{} steps", grouped(happening.env_steps)), happening.what)
+    let steps = format!("{} steps", grouped(happening.env_steps));
+    format!("{steps:>11}  {}", printable(&happening.what))
 }
 
 fn header(model: &Model) -> Line<'_> {
@@ -126,7 +127,7 @@ fn actor_table(status: &RunStatus) -> Table<'static> {
             _ => ("rolling", Color::Green),
         };
         Row::new([
-            Text::from(actor.name.clone()),
+            Text::from(printable(&actor.name)),
             Text::from(actor.pid.to_string()),
             Text::from(word).fg(colour),
             Text::from(grouped(actor.episodes)),
