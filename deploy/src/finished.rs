@@ -44,14 +44,16 @@ impl Finished {
     pub fn text(&self) -> String {
         let evaluation = self.summary["evaluation"].as_object();
         let results: Vec<TaskResult> = evaluation.into_iter().flatten().map(task_result).collect();
+        let digest = self.summary["weights_digest"].as_str();
         format!(
-            "{} environment steps, {} episodes, {} updates in {}\n{}weights digest {}\nrun directory  {}\n",
+            "{} environment steps, {} episodes, {} updates in {}\n{}{}run directory  {}\n",
             report::grouped(self.number("env_steps")),
             report::grouped(self.number("episodes")),
             report::grouped(self.number("updates")),
             report::duration(self.summary["wall_s"].as_f64().unwrap_or_default()),
-            report::table(&results),
-            self.summary["weights_digest"].as_str().unwrap_or_default(),
+            // One that failed was not evaluated at its end.
+            if results.is_empty() { String::new() } else { report::table(&results) },
+            digest.map_or_else(String::new, |digest| format!("weights digest {digest}\n")),
             self.root.display()
         )
     }
@@ -63,8 +65,9 @@ impl Finished {
 
     /// How the run stands, for people: it is over.
     pub fn status_text(&self) -> String {
-        let how = self.summary["ended"].as_str().map_or_else(String::new, |ended| format!(" ({ended})"));
-        format!("the run is over{how}\n{}", self.text())
+        let said: Vec<_> = ["ended", "reason"].iter().filter_map(|&key| self.summary[key].as_str()).collect();
+        let how = if said.is_empty() { String::new() } else { format!(": {}", said.join(", ")) };
+        format!("the run is over{}\n{}", report::printable(&how), self.text())
     }
 
     /// The same for programs, which know a running run by its `state` too.

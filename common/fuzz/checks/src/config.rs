@@ -34,12 +34,10 @@ pub fn check(input: &[u8]) -> bool {
     true
 }
 
-/// Whole inputs to begin from: the experiments that come with the program, every key, and settings.
+/// Whole inputs to begin from: the experiments that come with the program, every key of a method, and settings.
 pub fn seeds() -> Vec<(String, Vec<u8>)> {
-    let all = include_str!("../../../config/src/presets/all.toml");
-    // Comments say nothing to the parser, and an input half as long is mutated twice as fast.
-    let keys: Vec<&str> = all.lines().filter(|line| !line.starts_with('#') && !line.is_empty()).collect();
-    let all = keys.join("\n").replace("task_set = \"\"", "task_set = \"predator-prey\"");
+    let all = resolve("environment.task_set = \"predator-prey\"", "experiment.toml", &[]);
+    let all = all.and_then(|config| config.to_toml()).unwrap_or_default();
     let seeds = [
         ("all", all.as_str()),
         ("matrix-game", include_str!("../../../../deploy/experiments/matrix-game.toml")),
