@@ -23,6 +23,7 @@ pub struct Normal<'a> {
 }
 
 /// One row's Σ over dimensions of the role's entropy, and of its divergence from the posterior.
+#[inline(always)]
 pub fn row(role: Normal<'_>, posterior: Normal<'_>) -> [f64; 2] {
     let mut sums = [0.0; 2];
     for dim in 0..role.mean.len() {
@@ -36,6 +37,7 @@ pub fn row(role: Normal<'_>, posterior: Normal<'_>) -> [f64; 2] {
 
 /// One row's gradients by the role's mean and variance and by the posterior's, each times `scale`: what the loss's
 /// slope and the mean over rows make of it.
+#[inline(always)]
 pub fn row_gradients(
     role: Normal<'_>,
     posterior: Normal<'_>,

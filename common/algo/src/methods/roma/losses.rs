@@ -9,7 +9,7 @@ use crate::{
         roles::{self, Normal, RoleWeights},
     },
 };
-use rit_nn::{LayerNorm, LayoutBuilder, Linear, Tape, Var, View};
+use rit_nn::{LayerNorm, LayoutBuilder, Linear, Tape, Var, View, vectorized};
 
 /// D(ρ_i, ρ_j) = |`out`(LeakyReLU(`norm`(`hidden`([ρ_i ‖ ρ_j]))))|.
 #[derive(Clone, Debug)]
@@ -53,13 +53,10 @@ impl Dissimilarity {
         let active = tape.leaky_relu(normed);
         let signed = tape.linear(&self.out, active);
 
-        let [m, v, x] = [roles.role.mean, roles.role.variance, roles.sample];
-        let views = [m, v, x].map(|var| tape.view(var));
-        let of = |row: usize| Normal { mean: views[0].row(row), variance: views[1].row(row) };
-        let pairs = || first.iter().copied().zip(second.iter().copied());
-        let mut by_i: Vec<f32> = pairs()
-            .map(|(first, second)| dissimilarity::information(views[2].row(second), of(first)))
-            .collect();
+        let vars = [roles.role.mean, roles.role.variance, roles.sample];
+        let views = vars.map(|var| tape.view(var));
+        let mut by_i = vec![0.0; first.len()];
+        informations(views, [first, second], &mut by_i);
         let mut by_d: Vec<f32> = tape.slice(signed).iter().map(|signed| signed.abs()).collect();
         let named = [by_i.clone(), by_d.clone()];
 
@@ -75,17 +72,12 @@ impl Dissimilarity {
             (of_d, rest_d) = rest_d.split_at_mut(pairs);
             sum += dissimilarity::loss(of_i, of_d, config.soft_constraint, scale);
         }
-        let mut d = [m, v, x].map(|var| vec![0.0; var.len()]);
-        for ((first, second), &by) in pairs().zip(&by_i) {
-            let [d_m, d_v, d_x] = &mut d;
-            let (of_first, of_second) = (first * dim..(first + 1) * dim, second * dim..(second + 1) * dim);
-            let to = [&mut d_x[of_second], &mut d_m[of_first.clone()], &mut d_v[of_first]];
-            dissimilarity::information_gradients(views[2].row(second), of(first), by, to);
-        }
+        let mut d = vars.map(|var| vec![0.0; var.len()]);
+        informations_backward(views, [first, second], &by_i, d.each_mut().map(Vec::as_mut_slice));
         for (by, signed) in by_d.iter_mut().zip(tape.slice(signed)) {
             *by *= if *signed < 0.0 { -1.0 } else { 1.0 };
         }
-        for (var, d) in [m, v, x].into_iter().zip(&d) {
+        for (var, d) in vars.into_iter().zip(&d) {
             tape.seed(var, View::dense(d, dim));
         }
         tape.seed(signed, View::dense(&by_d, 1));
@@ -99,26 +91,96 @@ impl Dissimilarity {
 }
 
 /// Agent rows of steps that were taken.
-fn filled(rows: &Rows) -> impl Iterator<Item = usize> {
+fn filled(rows: &Rows) -> Vec<usize> {
     let groups = rows.groups.iter().zip(&rows.steps).filter(|(_, step)| step.filled);
-    groups.flat_map(|(group, _)| group.queries.clone())
+    groups.flat_map(|(group, _)| group.queries.clone()).collect()
 }
 
-/// The role's and the posterior's distribution of a row.
-fn normals<'t>(tape: &'t Tape<'_>, roles: &Roles) -> impl Fn(usize) -> [Normal<'t>; 2] {
-    let views =
-        [roles.role, roles.posterior].map(|normal| [tape.view(normal.mean), tape.view(normal.variance)]);
-    move |row| views.map(|[mean, variance]| Normal { mean: mean.row(row), variance: variance.row(row) })
+/// Means and variances of roles, then of their posteriors.
+fn distributions(roles: &Roles) -> [Var; 4] {
+    [roles.role.mean, roles.role.variance, roles.posterior.mean, roles.posterior.variance]
 }
 
 /// Σ entropy and Σ divergence over the rows of steps that were taken.
 pub(super) fn row_sums(tape: &Tape<'_>, rows: &Rows, roles: &Roles) -> [f64; 2] {
-    let of_row = normals(tape, roles);
-    filled(rows).fold([0.0; 2], |sums, row| {
-        let [role, posterior] = of_row(row);
-        let [entropy, divergence] = roles::row(role, posterior);
-        [sums[0] + entropy, sums[1] + divergence]
-    })
+    sum_rows(distributions(roles).map(|var| tape.view(var)), &filled(rows))
+}
+
+vectorized! {
+    fn sum_rows<'a>(distributions: [View<'a>; 4], rows: &'a [usize]) -> [f64; 2] {
+        let mut sums = [0.0; 2];
+        for &row in rows {
+            let [role, posterior] = normals(distributions, row);
+            let [entropy, divergence] = roles::row(role, posterior);
+            sums[0] += entropy;
+            sums[1] += divergence;
+        }
+        sums
+    }
+}
+
+vectorized! {
+    /// Writes the gradients by these rows' distributions.
+    fn rows_backward<'a>(
+        distributions: [View<'a>; 4],
+        rows: &'a [usize],
+        weights: RoleWeights,
+        scale: f32,
+        d: [&'a mut [f32]; 4],
+    ) {
+        let [d_mean, d_variance, d_mean_to, d_variance_to] = d;
+        for &row in rows {
+            let [role, posterior] = normals(distributions, row);
+            let of_row = row * role.mean.len()..(row + 1) * role.mean.len();
+            let to = [
+                &mut d_mean[of_row.clone()],
+                &mut d_variance[of_row.clone()],
+                &mut d_mean_to[of_row.clone()],
+                &mut d_variance_to[of_row],
+            ];
+            roles::row_gradients(role, posterior, weights, scale, to);
+        }
+    }
+}
+
+/// The role's and the posterior's distribution of a row.
+#[inline(always)]
+fn normals<'a>([mean, variance, mean_to, variance_to]: [View<'a>; 4], row: usize) -> [Normal<'a>; 2] {
+    let role = Normal { mean: mean.row(row), variance: variance.row(row) };
+    [role, Normal { mean: mean_to.row(row), variance: variance_to.row(row) }]
+}
+
+vectorized! {
+    /// How much the role of each pair's second row tells of its first, from means, variances and roles.
+    fn informations<'a>(of: [View<'a>; 3], pairs: [&'a [usize]; 2], to: &'a mut [f32]) {
+        let ([mean, variance, x], [first, second]) = (of, pairs);
+        for (pair, to) in to.iter_mut().enumerate() {
+            let (first, second) = (first[pair], second[pair]);
+            let normal = Normal { mean: mean.row(first), variance: variance.row(first) };
+            *to = dissimilarity::information(x.row(second), normal);
+        }
+    }
+}
+
+vectorized! {
+    /// From the gradients by pairs, adds to those by means, variances and roles.
+    fn informations_backward<'a>(
+        of: [View<'a>; 3],
+        pairs: [&'a [usize]; 2],
+        by: &'a [f32],
+        d: [&'a mut [f32]; 3],
+    ) {
+        let ([mean, variance, x], [first, second]) = (of, pairs);
+        let [d_mean, d_variance, d_x] = d;
+        let dim = x.cols;
+        for (pair, &by) in by.iter().enumerate() {
+            let (first, second) = (first[pair], second[pair]);
+            let normal = Normal { mean: mean.row(first), variance: variance.row(first) };
+            let (of_first, of_second) = (first * dim..(first + 1) * dim, second * dim..(second + 1) * dim);
+            let to = [&mut d_x[of_second], &mut d_mean[of_first.clone()], &mut d_variance[of_first]];
+            dissimilarity::information_gradients(x.row(second), normal, by, to);
+        }
+    }
 }
 
 /// The loss of the roles themselves and its slope, from the means over the whole batch.
@@ -128,15 +190,10 @@ pub(super) fn role_loss(sums: &[f64], config: &RoleConfig) -> (f64, f64) {
 
 /// Seeds the tape with the gradients of [`role_loss`], `scale` being its slope by the number of rows.
 pub(super) fn seed_rows(tape: &mut Tape<'_>, rows: &Rows, roles: &Roles, config: &RoleConfig, scale: f32) {
-    let vars = [roles.role.mean, roles.role.variance, roles.posterior.mean, roles.posterior.variance];
-    let mut d = vars.map(|var: Var| vec![0.0; var.len()]);
-    let of_row = normals(tape, roles);
-    for row in filled(rows) {
-        let [role, posterior] = of_row(row);
-        let to = d.each_mut().map(|d| &mut d[row * config.dim..(row + 1) * config.dim]);
-        roles::row_gradients(role, posterior, weights(config), scale, to);
-    }
-    drop(of_row);
+    let vars = distributions(roles);
+    let mut d = vars.map(|var| vec![0.0; var.len()]);
+    let to = d.each_mut().map(Vec::as_mut_slice);
+    rows_backward(vars.map(|var| tape.view(var)), &filled(rows), weights(config), scale, to);
     for (var, d) in vars.into_iter().zip(&d) {
         tape.seed(var, View::dense(d, config.dim));
     }
