@@ -14,8 +14,8 @@ const BOUND: f32 = 13.9;
 #[inline(always)]
 pub fn information(x: &[f32], of: Normal<'_>) -> f32 {
     let mut sum = 0.0;
-    for dim in 0..x.len() {
-        sum += (gaussian::log_density(x[dim], of.mean[dim], of.variance[dim]) + BOUND).max(-BOUND);
+    for (dim, &x) in x.iter().enumerate() {
+        sum += (gaussian::log_density(x, of.mean[dim], of.variance[dim]) + BOUND).max(-BOUND);
     }
     sum / x.len() as f32
 }
