@@ -1,4 +1,4 @@
-use super::*;
+use super::{kernels::LARGE, *};
 use crate::gradcheck::{check, noise};
 
 const INPUTS: usize = 5;
