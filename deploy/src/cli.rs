@@ -83,8 +83,14 @@ pub struct ConfigOptions {
     pub run_dir: Option<PathBuf>,
 }
 
+/// How a script tells how a run ended.
+const EXIT_CODES: &str = "\
+Exit codes: 0 finished (all steps are done, or --until is reached), 1 failed, 2 something given was wrong and nothing was \
+overwritten, 3 stopped by `rit ctl stop` or the page, 130 interrupted. summary.json in the run directory says the same, as \
+\"ended\".";
+
 #[derive(Args, Debug)]
-#[command(args_override_self = true)]
+#[command(args_override_self = true, after_help = EXIT_CODES)]
 pub struct TrainOptions {
     #[command(flatten)]
     pub config: ConfigOptions,
@@ -94,6 +100,7 @@ pub struct TrainOptions {
 }
 
 #[derive(Args, Debug)]
+#[command(after_help = EXIT_CODES)]
 pub struct LearnerOptions {
     /// Run directory that `rit train` or `rit learner --new` has made
     #[arg(long, value_name = "DIR")]

@@ -45,9 +45,10 @@ pub async fn run(options: CtlOptions) -> Result<ExitCode, Failure> {
         CtlCommand::Status => status(&control.status(StatusRequest {}).await?.into_inner(), options.json)?,
         CtlCommand::Pause => status(&control.pause(PauseRequest {}).await?.into_inner(), options.json)?,
         CtlCommand::Resume => status(&control.resume(ResumeRequest {}).await?.into_inner(), options.json)?,
-        CtlCommand::Stop { drain } => {
-            status(&control.stop(StopRequest { drain }).await?.into_inner(), options.json)?
-        }
+        CtlCommand::Stop { drain } => status(
+            &control.stop(StopRequest { drain, interrupted: false }).await?.into_inner(),
+            options.json,
+        )?,
         CtlCommand::Set { settings } => {
             status(&control.set(set_request(&settings)?).await?.into_inner(), options.json)?
         }

@@ -8,9 +8,6 @@ use rit_learner::{LearnerError, evaluation::TasksError, weights_file::WeightsFil
 use rit_proto::transport::{ConnectError, CredentialsError, status_words};
 use std::{fmt, process::ExitCode};
 
-/// Exit code of a run that was interrupted and ended in order, as shells have it for Ctrl-C.
-pub const INTERRUPTED: u8 = 130;
-
 /// Exit code of a learner under `rit train` when the system refuses now what it may grant later (shared memory, a port),
 /// as `sysexits.h` has it for a failure that passes: the supervisor starts it again.
 pub const UNAVAILABLE: u8 = 75;

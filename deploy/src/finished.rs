@@ -40,8 +40,25 @@ impl Finished {
         (trained.unwrap_or(0) <= finished.number("env_steps")).then_some(finished)
     }
 
-    /// For people.
+    /// For people; a run that did not finish says first how it ended.
     pub fn text(&self) -> String {
+        match self.how().as_str() {
+            "" | "finished" => self.figures(),
+            how => format!("{}\n{}", report::printable(how), self.figures()),
+        }
+    }
+
+    /// How it ended, and why if it failed.
+    fn how(&self) -> String {
+        let word = |key: &str| self.summary[key].as_str().unwrap_or_default();
+        match (word("ended"), word("reason")) {
+            ("until", _) => "finished: the goal of training.until is reached".to_owned(),
+            (ended, "") => ended.to_owned(),
+            (ended, reason) => format!("{ended}: {reason}"),
+        }
+    }
+
+    fn figures(&self) -> String {
         let evaluation = self.summary["evaluation"].as_object();
         let results: Vec<TaskResult> = evaluation.into_iter().flatten().map(task_result).collect();
         let digest = self.summary["weights_digest"].as_str();
@@ -67,7 +84,7 @@ impl Finished {
     pub fn status_text(&self) -> String {
         let said: Vec<_> = ["ended", "reason"].iter().filter_map(|&key| self.summary[key].as_str()).collect();
         let how = if said.is_empty() { String::new() } else { format!(": {}", said.join(", ")) };
-        format!("the run is over{}\n{}", report::printable(&how), self.text())
+        format!("the run is over{}\n{}", report::printable(&how), self.figures())
     }
 
     /// The same for programs, which know a running run by its `state` too.

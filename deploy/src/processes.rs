@@ -30,12 +30,9 @@ pub async fn learner(options: LearnerOptions, logs: LogOptions) -> Result<ExitCo
     let ended = rit_learner::run(run_dir, config, set_log, shutdown).instrument(span).await;
     let failed = match ended.map_err(Failure::from) {
         Ok(summary) => {
-            tracing::info!(
-                digest = summary.weights_digest,
-                env_steps = summary.progress.env_steps,
-                "the run is over"
-            );
-            return Ok(ExitCode::SUCCESS);
+            let (digest, env_steps) = (summary.weights_digest, summary.progress.env_steps);
+            tracing::info!(digest, env_steps, ended = %summary.ended, "the run is over");
+            return Ok(ExitCode::from(summary.ended.exit_code()));
         }
         // For people, what they gave it does not fit what is there.
         Err(Failure::Unavailable(error)) if !options.supervised => Failure::Input(error),

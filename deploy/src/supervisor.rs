@@ -14,10 +14,15 @@ mod tests;
 
 use crate::failure::UNAVAILABLE;
 use restarts::{DEATHS_MAX, Restarts};
+use rit_learner::summary::Ended;
 use std::{collections::BTreeMap, time::Duration};
 
 pub use messages::{Effect, Event, Exit, Hung, Outcome, Place, Standing};
 pub use shell::watch_over;
+
+/// Exit codes of a learner that has ended a run in order: as somebody asked it to, or as a signal did.
+const STOPPED: i32 = Ended::Stopped.exit_code() as i32;
+const INTERRUPTED: i32 = Ended::Interrupted.exit_code() as i32;
 
 /// How long a learner may take to answer.
 const START_TIMEOUT: Duration = Duration::from_secs(30);
@@ -329,8 +334,13 @@ impl Supervisor {
         let died = format!("the learner {exit}: {last_words} (log: {log})");
         self.contact = Contact::Starting(now, String::new());
         match exit {
-            Exit::Code(0) if self.interrupted => self.end(Outcome::Interrupted, now, effects),
-            Exit::Code(0) => self.end(Outcome::Finished, now, effects),
+            // It has ended the run in order, and its summary says how.
+            Exit::Code(0 | STOPPED) if !self.interrupted => self.end(Outcome::Finished, now, effects),
+            Exit::Code(0 | STOPPED | INTERRUPTED) if self.interrupted => {
+                self.end(Outcome::Interrupted, now, effects);
+            }
+            // Somebody has ended the learner alone, which is no wish to end the run.
+            Exit::Code(INTERRUPTED) => self.restart(Place::Learner, exit, last_words, now, effects),
             _ if self.interrupted => self.fail(false, died, now, effects),
             // What was typed or given is wrong, and will be the second time.
             Exit::Code(2) => self.fail(true, last_words.to_owned(), now, effects),

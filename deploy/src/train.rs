@@ -3,7 +3,7 @@
 use crate::{
     cli::{ConfigOptions, TrainOptions},
     experiments::{self, Experiment},
-    failure::{Failure, INTERRUPTED},
+    failure::Failure,
     finished::Finished,
     logging::LogOptions,
     output::{self, Reader},
@@ -11,7 +11,10 @@ use crate::{
     supervisor::{Outcome, watch_over},
 };
 use rit_config::{Config, OwnedRunDir, RunDir};
-use rit_learner::life;
+use rit_learner::{
+    life,
+    summary::{Ended, Summary},
+};
 use std::{num::NonZero, path::Path, process::ExitCode};
 use tracing::Instrument as _;
 
@@ -51,10 +54,12 @@ async fn supervise(
     // Whatever became of the children, nothing of the run stays in shared memory.
     life::remove_dead(run_dir);
     match outcome {
-        Outcome::Finished => print_summary(run_dir, json).map(|()| ExitCode::SUCCESS),
-        Outcome::Interrupted => {
+        // What lies there of an earlier end is not this one's.
+        Outcome::Interrupted if !begun => Ok(ExitCode::from(Ended::Interrupted.exit_code())),
+        Outcome::Finished | Outcome::Interrupted => {
             print_summary(run_dir, json)?;
-            Ok(ExitCode::from(INTERRUPTED))
+            let ended = Summary::read(run_dir).map_err(Failure::runtime)?.map(|summary| summary.ended);
+            Ok(ExitCode::from(ended.unwrap_or(Ended::Failed).exit_code()))
         }
         Outcome::Failed { input: true, message } => {
             if !begun {
@@ -63,7 +68,12 @@ async fn supervise(
             }
             Err(Failure::input_message(message))
         }
-        Outcome::Failed { input: false, message } => Err(Failure::runtime_message(message)),
+        Outcome::Failed { input: false, message } => {
+            if begun && let Err(error) = Summary::write_failed(run_dir, &message) {
+                tracing::warn!(%error, "summary.json was not written");
+            }
+            Err(Failure::runtime_message(message))
+        }
     }
 }
 

@@ -47,7 +47,7 @@ fn a_run_is_paused_evaluated_saved_resumed_and_stopped() {
     assert_eq!(json(&train.ctl(&["resume"]))["state"], "running");
     train.wait_for("training again", |status| status["env_steps"].as_u64() > still["env_steps"].as_u64());
     assert_eq!(json(&train.ctl(&["stop"]))["state"], "stopping");
-    let summary = train.finish();
+    let summary = train.finish_stopped();
     assert!(summary["env_steps"].as_u64() < Some(50_000));
 }
 
@@ -109,7 +109,7 @@ fn settings_change_while_the_run_goes_on() {
         assert!(stderr.contains(words), "{stderr}");
     }
     json(&train.ctl(&["stop"]));
-    train.finish();
+    train.finish_stopped();
 }
 
 /// Counts that change faster than actors come and go: each slot is filled once, and the run goes on.
@@ -139,7 +139,7 @@ fn the_number_of_actors_may_change_again_and_again() {
         names == ["actor-0", "actor-1", "actor-2"]
     });
     json(&train.ctl(&["stop"]));
-    train.finish();
+    train.finish_stopped();
 }
 
 #[test]
@@ -151,7 +151,7 @@ fn a_drained_run_has_nothing_under_way_and_goes_on_to_the_same_weights() {
     let mut train = folder.start(&[&steps[..], &["--actors", "2"]].concat());
     train.wait_for("training", |status| status["updates"].as_u64() > Some(100));
     assert_eq!(json(&train.ctl(&["stop", "--drain"]))["state"], "stopping");
-    let halfway = train.finish();
+    let halfway = train.finish_stopped();
     assert!(halfway["env_steps"].as_u64() < Some(3000));
     let log = std::fs::read_to_string(folder.run_dir().join("logs/learner.log")).unwrap();
     assert!(log.contains("rejected: {}"), "no episode was taken back: {log}");

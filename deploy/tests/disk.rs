@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{RunFolder, output};
+use common::{RunFolder, Train, output};
 use rustix::mount::{MountFlags, UnmountFlags, mount, mount_remount, unmount};
 use std::{
     fs,
@@ -74,6 +74,39 @@ fn a_full_disk_costs_a_checkpoint_and_nothing_else() {
     assert_eq!(summary["weights_digest"], undisturbed.train(RUN)["weights_digest"]);
     let lines = |run_dir: &Path| fs::read_to_string(run_dir.join("metrics.jsonl")).unwrap().lines().count();
     assert_eq!(lines(&folder.run_dir()), lines(&undisturbed.run_dir()), "no line of the metrics is missing");
+}
+
+#[test]
+fn a_disk_that_is_full_at_the_end_keeps_the_weights() {
+    let (folder, elsewhere) = (RunFolder::new(), RunFolder::new());
+    let Some(disk) = SmallDisk::mount(&folder) else { return };
+    let rescue = format!("checkpoints.rescue_dir={}", elsewhere.path().display());
+    let mut train = folder.start(&[RUN, &["--steps", "1000000", "--set", &rescue]].concat());
+    train.wait_for("training", |status| status["updates"].as_u64() > Some(100));
+    let filler = disk.fill();
+    assert!(train.ctl(&["stop"]).status.success());
+    let refused = train.wait_for("a warning", |status| {
+        status["happenings"].to_string().contains("the last checkpoint is not written")
+    });
+    assert_eq!(refused["state"], "stopping");
+    // Room again while it tries: nothing is lost.
+    fs::remove_file(&filler).unwrap();
+    let summary = train.finish_stopped();
+    let digest = summary["weights_digest"].as_str().unwrap();
+    assert!(folder.run_dir().join("checkpoints/latest/weights.safetensors").exists());
+
+    // No room until it gives up: the weights are in the other place.
+    let mut train = Train::resume(&folder, &["--set", "checkpoints.last_retry_ms=0"]);
+    train.wait_for("training", |status| status["updates"].as_u64() > Some(200));
+    disk.fill();
+    assert!(train.ctl(&["stop"]).status.success());
+    let output = train.wait();
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{stderr}");
+    assert!(stderr.contains("the last weights are in"), "{stderr}");
+    let rescued = fs::read_dir(elsewhere.path()).unwrap().next().unwrap().unwrap();
+    assert!(rescued.file_name().to_str().unwrap().starts_with("run-step-"));
+    assert!(rescued.metadata().unwrap().len() > 1000 && !digest.is_empty());
 }
 
 #[test]

@@ -83,7 +83,7 @@ async fn a_slow_reader_misses_statuses_alone_and_training_does_not_wait() {
     // Once it has caught up it gets statuses again.
     while !matches!(updates.message().await.unwrap().unwrap().update, Some(Update::Status(_))) {}
     train.ctl(&["stop"]);
-    train.finish();
+    train.finish_stopped();
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -122,7 +122,7 @@ async fn a_status_accounts_for_everything() {
         assert!(happened.iter().any(|happening| happening.starts_with(what)), "{what} in {happened:?}");
     }
     train.ctl(&["stop"]);
-    train.finish();
+    train.finish_stopped();
 }
 
 #[test]
@@ -137,5 +137,5 @@ fn people_get_lines() {
     assert!(text.starts_with("0 steps · 0 updates · greedy: return "), "{text}");
     assert!(text.contains("td loss ") && text.contains("epsilon 0."), "{text}");
     train.ctl(&["stop"]);
-    train.finish();
+    train.finish_stopped();
 }

@@ -123,5 +123,5 @@ fn on_a_terminal_it_draws_and_q_or_ctrl_c_ends_the_view_alone() {
     }
     train.wait_for("training after all", |status| status["state"] == "running");
     train.ctl(&["stop"]);
-    train.finish();
+    train.finish_stopped();
 }

@@ -521,5 +521,5 @@ async fn a_browser_shows_the_run_and_steers_it() {
     browser.click("stop").await;
     browser.click("stop-confirm").await;
     browser.wait_for_state("ended").await;
-    train.finish();
+    train.finish_stopped();
 }

@@ -156,6 +156,11 @@ pub enum CheckpointError {
     Config(#[from] rit_config::ConfigError),
 }
 
+/// What the newest checkpoint says of itself, if there is one that can be read at all.
+pub fn newest_manifest(run_dir: &RunDir) -> Option<Manifest> {
+    folders::list_named_right(&run_dir.checkpoints()).ok()?.pop().map(|(_, manifest)| manifest)
+}
+
 /// Writes a checkpoint, points `latest` to it and removes all but the newest `keep`. Returns its folder, relative
 /// to the run directory. Replay up to it must be durable already.
 ///

@@ -4,6 +4,7 @@ use crate::{
     coordinator::Control,
     metrics::{Follower, Line},
     run_handle::{AskError, RunHandle},
+    summary::Ended,
 };
 use rit_proto::v1::{self, control_server};
 use std::{pin::Pin, time::Duration};
@@ -109,8 +110,9 @@ impl control_server::Control for ControlService {
     }
 
     async fn stop(&self, request: Request<v1::StopRequest>) -> Result<Response<v1::RunStatus>, Status> {
-        let drain = request.into_inner().drain;
-        Ok(Response::new(self.run.ask(|answer| Control::Stop { drain, answer }).await?))
+        let v1::StopRequest { drain, interrupted } = request.into_inner();
+        let ended = if interrupted { Ended::Interrupted } else { Ended::Stopped };
+        Ok(Response::new(self.run.ask(|answer| Control::Stop { drain, ended, answer }).await?))
     }
 
     async fn set(&self, request: Request<v1::SetRequest>) -> Result<Response<v1::RunStatus>, Status> {

@@ -17,6 +17,7 @@ use crate::{
     gauges::{Happenings, RateWindow, Stopwatch},
     ledger::{ActorId, Counts, Lease, Ledger, Reason},
     receive::Fence,
+    summary::Ended,
     trainer::{Beginning, News, Standing},
     writer::CheckpointEnded,
 };
@@ -89,7 +90,7 @@ pub struct Coordinator {
     next_actor: ActorId,
     state: v1::RunState,
     /// The run ends when nothing is under way any more.
-    draining: bool,
+    draining: Option<Ended>,
     standing: Standing,
     /// What updates report.
     measures: &'static [Measure],
@@ -125,7 +126,7 @@ impl Coordinator {
             actors: BTreeMap::new(),
             next_actor: 0,
             state: v1::RunState::Running,
-            draining: false,
+            draining: None,
             frames_refused: BTreeMap::new(),
             frames: 0,
             batches_in_training: 0,
@@ -263,11 +264,12 @@ impl Coordinator {
                 }
                 self.hand_out(effects);
             }
+            Input::News(News::Warning(what)) => self.warned(what),
             Input::News(News::Ending) => self.state = v1::RunState::Stopping,
             Input::CheckpointEnded(ended) => self.checkpoint_ended(ended),
             Input::Pause => self.pause(),
             Input::Resume => self.resume(effects),
-            Input::Stop { drain } => self.stop(drain, effects),
+            Input::Stop { drain, ended } => self.stop(drain, ended, effects),
             Input::Set(config) => self.set(config, effects),
             Input::Look => self.look(effects),
             Input::Over => self.part_with_actors(effects),

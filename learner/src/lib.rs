@@ -23,6 +23,7 @@ pub mod replay_log;
 pub mod rollout_service;
 mod run;
 pub mod run_handle;
+pub mod summary;
 pub mod tensorboard;
 pub mod trainer;
 pub mod web;

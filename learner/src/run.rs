@@ -10,7 +10,8 @@ use crate::{
     replay_log::{ReplayLog, ReplayLogError},
     rollout_service::RolloutService,
     run_handle::{RunHandle, SetLog},
-    trainer::{Summary, TrainError, Trainer},
+    summary::{Ended, Summary},
+    trainer::{TrainError, Trainer},
     web::{Web, WebError},
     weights::WeightsService,
     writer::Writer,
@@ -205,6 +206,9 @@ pub async fn run(
         .add_service(rollout.max_decoding_message_size(REQUEST_BYTES_MAX))
         .add_service(EpisodesServer::new(episodes).max_decoding_message_size(episode_bytes_max))
         .add_service(ControlServer::new(control).max_decoding_message_size(REQUEST_BYTES_MAX));
+    // From here on it goes on: what was said of its end is true no more.
+    Summary::remove(&run_dir)
+        .map_err(|error| LearnerError::Io { what: run_dir.summary().display().to_string(), error })?;
     // What a learner that was killed has left; this one may not listen for other hosts.
     let _ = fs::remove_file(run_dir.remote_address());
     let (close, closed) = watch::channel(());
@@ -226,7 +230,7 @@ pub async fn run(
         () = &mut coordinating => {}
         () = &mut shutdown => {
             let (answer, _) = oneshot::channel();
-            let _ = events.send(Event::Control(crate::coordinator::Control::Stop { drain: false, answer })).await;
+            let _ = events.send(Event::Control(crate::coordinator::Control::Stop { drain: false, ended: Ended::Interrupted, answer })).await;
             coordinating.await;
         }
     }
@@ -245,10 +249,16 @@ pub async fn run(
     let _ = tokio::time::timeout(CLOSE_TIMEOUT, serving_web.join_next()).await;
     let _ = fs::remove_file(run_dir.address());
     let _ = fs::remove_file(run_dir.remote_address());
-    receiving.await.map_err(|_| LearnerError::Panicked("receive"))??;
-    let result = training.await.map_err(|_| LearnerError::Panicked("train"))?;
+    let received = receiving.await.map_err(|_| LearnerError::Panicked("receive")).flatten();
+    let trained = training.await.map_err(|_| LearnerError::Panicked("train"));
     writing.await.map_err(|_| LearnerError::Panicked("write"))?;
-    Ok(result?)
+    let ended = received.and_then(|()| Ok(trained??));
+    if let Err(error) = &ended
+        && let Err(error) = Summary::write_failed(&run_dir, &error.to_string())
+    {
+        tracing::error!(%error, "summary.json was not written");
+    }
+    ended
 }
 
 /// A receiver in a place of its own; the second value says where that is not where it should be.

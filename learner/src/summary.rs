@@ -31,7 +31,7 @@ pub enum Ended {
 
 impl Ended {
     /// The exit code of `rit train` and `rit learner`.
-    pub fn exit_code(self) -> u8 {
+    pub const fn exit_code(self) -> u8 {
         match self {
             Self::Finished | Self::Until => 0,
             Self::Failed => 1,

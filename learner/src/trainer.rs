@@ -8,6 +8,8 @@ use crate::{
     measured::Measured,
     metrics::{Follower, Line, MetricsFile, Recent},
     replay::Replay,
+    replay_log::remedy,
+    summary::{Ended, Summary},
     tensorboard::{EventFile, Position},
     weights::{Snapshot, WeightsBoard},
     weights_file,
@@ -20,14 +22,18 @@ use rit_algo::{
 use rit_config::{Config, RunDir, Until};
 use rit_env::{Split, rollout::LostEpisode};
 use rit_episode::{Episode, RunSeed, Stream};
-use serde::Serialize;
 use std::{
     collections::{BTreeMap, VecDeque},
     fs, io,
-    path::PathBuf,
+    path::{Path, PathBuf},
     sync::{Arc, mpsc},
+    thread,
+    time::{Duration, Instant},
 };
 use tokio::sync::oneshot;
+
+/// From one attempt at a run's last files to the next.
+const RETRY_EVERY: Duration = Duration::from_secs(1);
 
 /// What the trainer is asked to do, one after another.
 #[derive(Debug)]
@@ -38,8 +44,8 @@ pub enum Work {
     Checkpoint(oneshot::Sender<Checkpointed>),
     /// Go on with other settings.
     Set(Arc<Config>),
-    /// End the run.
-    Stop,
+    /// End the run, as this.
+    Stop(Ended),
 }
 
 /// A checkpoint that was asked for.
@@ -75,20 +81,8 @@ pub enum News {
     Trained(Terms, Standing),
     /// The run is over and will take no further batch; its last files are being written.
     Ending,
-}
-
-/// What a run came to: `summary.json`.
-#[derive(Clone, Debug, Serialize)]
-pub struct Summary {
-    /// How far training came.
-    #[serde(flatten)]
-    pub progress: Progress,
-    /// Seconds the learner ran.
-    pub wall_s: f64,
-    /// SHA-256 of the final weights.
-    pub weights_digest: String,
-    /// Greedy episodes of the final weights, by training task.
-    pub evaluation: BTreeMap<String, TaskResult>,
+    /// Something that somebody should know of.
+    Warning(String),
 }
 
 /// Why training ended early.
@@ -100,6 +94,9 @@ pub enum TrainError {
     /// The last checkpoint could not be written.
     #[error("the last checkpoint was not written: {0}; `rit train --resume` goes on from the one before")]
     Checkpoint(String),
+    /// The summary could not be written.
+    #[error("summary.json was not written: {0}; checkpoints are whole")]
+    Summary(String),
     /// A file of the run directory could not be written.
     #[error("{path}: {error}")]
     Io {
@@ -266,14 +263,33 @@ impl Trainer {
     /// # Errors
     /// When a file cannot be written or the weights diverge.
     pub fn run(mut self, work: &mpsc::Receiver<Work>) -> Result<Summary, TrainError> {
+        let finished = self.train_until_over(work).and_then(|ended| {
+            (self.news)(News::Ending);
+            self.finish(ended, work)
+        });
+        if let Err(error) = &finished {
+            (self.news)(News::Ending);
+            let summary = Summary { reason: Some(error.to_string()), ..self.summary(Ended::Failed) };
+            // A disk that refuses has been complained of.
+            let _ = summary.write(&self.run_dir);
+        }
+        finished
+    }
+
+    /// Works until the run is over; returns how it ended.
+    fn train_until_over(&mut self, work: &mpsc::Receiver<Work>) -> Result<Ended, TrainError> {
         if self.standing.evaluation.is_none() {
             self.evaluate()?;
         }
-        let mut over = self.is_over();
-        while !over && let Ok(work) = work.recv() {
+        loop {
+            if let Some(ended) = self.over() {
+                return Ok(ended);
+            }
+            // Nobody is left to ask: the threads around this one have failed.
+            let Ok(work) = work.recv() else { return Ok(Ended::Failed) };
             match work {
                 Work::Batch(episodes) => {
-                    over = self.train(episodes)?;
+                    self.train(episodes)?;
                     // The terms of the batch that `policy_lag` leaves to be opened next.
                     let terms = Terms {
                         weights_version: self.standing.progress.updates,
@@ -282,7 +298,7 @@ impl Trainer {
                     self.terms.pop_front();
                     self.terms.push_back(terms);
                     (self.news)(News::Trained(terms, self.standing.clone()));
-                    if self.is_due(self.config.checkpoints.every_env_steps) && !over {
+                    if self.is_due(self.config.checkpoints.every_env_steps) && self.over().is_none() {
                         self.checkpoint(None);
                     }
                 }
@@ -303,15 +319,13 @@ impl Trainer {
                         self.checkpoint(None);
                     }
                 }
-                Work::Stop => break,
+                Work::Stop(ended) => return Ok(ended),
             }
         }
-        (self.news)(News::Ending);
-        self.finish()
     }
 
-    /// One batch: into replay, where there is one, one update, and whatever is due. Returns whether the run is over.
-    fn train(&mut self, episodes: Vec<Episode>) -> Result<bool, TrainError> {
+    /// One batch: into replay, where there is one, one update, and whatever is due.
+    fn train(&mut self, episodes: Vec<Episode>) -> Result<(), TrainError> {
         let algorithm = &self.config.algorithm;
         let progress = &mut self.standing.progress;
         self.env_steps_before = progress.env_steps;
@@ -367,7 +381,7 @@ impl Trainer {
         if self.is_due(self.config.evaluation.every_env_steps) {
             self.evaluate()?;
         }
-        Ok(self.is_over())
+        Ok(())
     }
 
     /// The scheduled evaluation of the training tasks: always the same episodes, so that one curve's points
@@ -394,12 +408,15 @@ impl Trainer {
         self.evaluator.evaluate(&mut acting, &tasks, episodes, evaluation_seed(&self.config))
     }
 
-    /// Whether all steps are done, or an evaluation made just now says that it is enough. What a checkpoint holds
-    /// counts: a run that was over when it was saved is over when it is loaded.
-    fn is_over(&self) -> bool {
+    /// How the run ends, if all steps are done or an evaluation made just now says that it is enough. What a checkpoint
+    /// holds counts: a run that was over when it was saved is over when it is loaded.
+    fn over(&self) -> Option<Ended> {
         let Standing { progress, evaluation, .. } = &self.standing;
         let reached = |(at, results): &(Progress, Vec<TaskResult>)| at == progress && self.reached(results);
-        progress.env_steps >= self.config.training.t_max || evaluation.as_ref().is_some_and(reached)
+        if evaluation.as_ref().is_some_and(reached) {
+            return Some(Ended::Until);
+        }
+        (progress.env_steps >= self.config.training.t_max).then_some(Ended::Finished)
     }
 
     fn reached(&self, results: &[TaskResult]) -> bool {
@@ -453,24 +470,102 @@ impl Trainer {
         weights_digest
     }
 
-    fn finish(mut self) -> Result<Summary, TrainError> {
+    /// The last checkpoint, the last evaluation and the summary.
+    fn finish(&mut self, ended: Ended, work: &mpsc::Receiver<Work>) -> Result<Summary, TrainError> {
         let (done, written) = oneshot::channel();
-        let weights_digest = self.checkpoint(Some(done));
-        let results = self.greedy(self.config.evaluation.episodes)?;
-        let written =
-            written.blocking_recv().map_err(|_| TrainError::Checkpoint("the writer has gone".into()))?;
-        written.map_err(|error| TrainError::Checkpoint(error.to_string()))?;
-        let summary = Summary {
+        self.checkpoint(Some(done));
+        let evaluation = by_task(&self.greedy(self.config.evaluation.episodes)?);
+        let mut first = Some(written);
+        let checkpointed = self.insist("the last checkpoint", work, |trainer| {
+            let written = first.take().unwrap_or_else(|| {
+                let (done, written) = oneshot::channel();
+                trainer.checkpoint(Some(done));
+                written
+            });
+            let written = written.blocking_recv().map_err(|_| "the writer has gone".to_owned())?;
+            written.map(drop).map_err(|error| error.to_string())
+        });
+        if let Err(error) = checkpointed {
+            return Err(TrainError::Checkpoint(self.rescue(error)));
+        }
+        let summary = Summary { evaluation, ..self.summary(ended) };
+        self.insist("summary.json", work, |trainer| {
+            summary.write(&trainer.run_dir).map_err(|error| format!("{error}{}", remedy(&error)))
+        })
+        .map_err(TrainError::Summary)?;
+        Ok(summary)
+    }
+
+    fn summary(&self, ended: Ended) -> Summary {
+        Summary {
+            ended,
+            reason: None,
             progress: self.standing.progress,
             wall_s: self.metrics.wall_s(),
-            weights_digest,
-            evaluation: by_task(&results),
-        };
-        let path = self.run_dir.summary();
-        let text = serde_json::to_vec_pretty(&summary).map_err(io::Error::from);
-        let written = text.and_then(|text| fs::write(&path, text));
-        written.map_err(|error| TrainError::Io { path, error })?;
-        Ok(summary)
+            weights_digest: Some(weights_file::digest(self.learner.params())),
+            evaluation: BTreeMap::new(),
+        }
+    }
+
+    /// Tries until it is done, for as long as `checkpoints.last_retry_ms` says: a disk that is full now may not be later.
+    /// Says so once. A second wish to stop is one not to wait.
+    fn insist(
+        &mut self,
+        what: &str,
+        work: &mpsc::Receiver<Work>,
+        mut attempt: impl FnMut(&mut Self) -> Result<(), String>,
+    ) -> Result<(), String> {
+        let begun = Instant::now();
+        let mut refused = false;
+        loop {
+            let error = match attempt(self) {
+                Ok(()) if refused => {
+                    (self.news)(News::Warning(format!("{what} is written now")));
+                    return Ok(());
+                }
+                Ok(()) => return Ok(()),
+                Err(error) => error,
+            };
+            let limit = Duration::from_millis(self.config.checkpoints.last_retry_ms);
+            if begun.elapsed() >= limit {
+                return Err(error);
+            }
+            if !std::mem::replace(&mut refused, true) {
+                (self.news)(News::Warning(format!(
+                    "{what} is not written: {error}; trying again for {} s, then the weights go to \
+                     checkpoints.rescue_dir, if that is set (`rit ctl set` can do so now)",
+                    limit.as_secs()
+                )));
+            }
+            match work.recv_timeout(RETRY_EVERY) {
+                Ok(Work::Set(config)) => self.config = Config::clone(&config),
+                Ok(Work::Stop(_)) => return Err(error),
+                // Whoever wants more of a run that is over is told so by its end.
+                Ok(Work::Batch(_) | Work::Checkpoint(_)) | Err(mpsc::RecvTimeoutError::Timeout) => {}
+                Err(mpsc::RecvTimeoutError::Disconnected) => thread::sleep(RETRY_EVERY),
+            }
+        }
+    }
+
+    /// Writes the weights to `checkpoints.rescue_dir`, if there is one; returns the error with what came of it.
+    fn rescue(&self, error: String) -> String {
+        let folder = &self.config.checkpoints.rescue_dir;
+        if folder.is_empty() {
+            return error;
+        }
+        let run = self.run_dir.root().file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let name = format!("{run}-step-{:012}.safetensors", self.standing.progress.env_steps);
+        let path = Path::new(folder).join(name);
+        let weights = weights_file::encode(self.learner.model().layout(), self.learner.params());
+        let written = weights.map_err(|error| error.to_string()).and_then(|bytes| {
+            fs::create_dir_all(folder)
+                .and_then(|()| fs::write(&path, bytes))
+                .map_err(|error| format!("{error}{}", remedy(&error)))
+        });
+        match written {
+            Ok(()) => format!("{error}; the last weights are in {}", path.display()),
+            Err(rescue) => format!("{error}; nor are the last weights in {}: {rescue}", path.display()),
+        }
     }
 }
 

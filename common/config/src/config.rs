@@ -226,6 +226,8 @@ pub struct Evaluation {
 pub struct Checkpoints {
     pub every_env_steps: u64,
     pub keep: usize,
+    pub last_retry_ms: u64,
+    pub rescue_dir: String,
 }
 
 /// `[actors]`.
@@ -511,6 +513,7 @@ impl Config {
             ("evaluation.testing_episodes", evaluation.testing_episodes.into(), 1.0, COUNT),
             ("checkpoints.every_env_steps", self.checkpoints.every_env_steps.into(), 1.0, STEPS),
             ("checkpoints.keep", self.checkpoints.keep.into(), 1.0, COUNT),
+            ("checkpoints.last_retry_ms", self.checkpoints.last_retry_ms.into(), 0.0, 86_400_000.0),
             ("actors.count", self.actors.count.into(), 0.0, 256.0),
             ("actors.count_max", self.actors.count_max.into(), 1.0, 256.0),
             ("actors.remote", self.actors.remote.into(), 0.0, 256.0),

@@ -114,11 +114,13 @@ const FREE: [&str; 10] = [
 
 /// Keys that a running learner can change. Of these `algorithm.epsilon_finish` changes the
 /// result, and `evaluation` does where `training.until` ends the run at an evaluation.
-pub(crate) const LIVE: [&str; 7] = [
+pub(crate) const LIVE: [&str; 9] = [
     "algorithm.epsilon_finish",
     "evaluation.every_env_steps",
     "evaluation.episodes",
     "checkpoints.every_env_steps",
+    "checkpoints.last_retry_ms",
+    "checkpoints.rescue_dir",
     "actors.count",
     "actors.heartbeat_timeout_ms",
     "learner.metrics_every_env_steps",

@@ -1,5 +1,6 @@
 //! What the supervisor is told, and what it wants done. Plain data: no process, clock or socket in it.
 
+use super::INTERRUPTED;
 use std::fmt;
 
 /// A process of the run, by the place it holds. Whoever runs there, and however often it was started anew: the place
@@ -35,6 +36,7 @@ pub enum Exit {
 impl fmt::Display for Exit {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
+            Self::Code(INTERRUPTED) => f.write_str("was asked to end by a signal"),
             Self::Code(code) => write!(f, "ended with exit code {code}"),
             Self::Signal(signal) => write!(f, "was ended by signal {signal}"),
             Self::NotStarted(why) => write!(f, "could not be started ({why})"),
@@ -112,7 +114,7 @@ pub enum Effect {
 /// How a run came to its end.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Outcome {
-    /// The learner says that it is done.
+    /// The learner says that it is done, or was asked to stop; `summary.json` says which.
     Finished,
     /// It was interrupted, and ended in order.
     Interrupted,

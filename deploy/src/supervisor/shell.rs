@@ -162,7 +162,7 @@ impl Shell<'_> {
     fn stop_run(&mut self) {
         if let Some(mut control) = self.control.clone() {
             // Its end is the answer; one that does not hear is asked how it stands, and found hanging.
-            tokio::spawn(async move { control.stop(StopRequest::default()).await });
+            tokio::spawn(async move { control.stop(StopRequest { drain: false, interrupted: true }).await });
         }
     }
 

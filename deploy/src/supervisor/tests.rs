@@ -269,7 +269,7 @@ fn an_interrupt_ends_the_run_whatever_the_learner_is_doing() {
     let mut training = World::new(2);
     training.tell(Event::Interrupted);
     training.ends(Place::Actor(0), Exit::Code(0));
-    training.ends(Place::Learner, Exit::Code(0));
+    training.ends(Place::Learner, Exit::Code(INTERRUPTED));
     training.settle();
     assert_eq!(training.over, Some(Outcome::Interrupted));
     // Waiting to be started again.
@@ -296,6 +296,18 @@ fn actors_that_go_while_the_run_ends_are_not_replaced() {
     world.pass(seconds(20));
     assert_eq!(world.actors(), [1]);
     world.ends(Place::Learner, Exit::Code(0));
+    world.settle();
+    assert_eq!(world.over, Some(Outcome::Finished));
+}
+
+#[test]
+fn a_learner_that_a_signal_asked_to_end_is_restarted_and_one_that_was_stopped_is_not() {
+    let mut world = World::new(1);
+    world.ends(Place::Learner, Exit::Code(INTERRUPTED));
+    world.settle();
+    assert_eq!((world.actors(), &world.over), (vec![0], &None));
+    assert!(world.alive.contains_key(&Place::Learner));
+    world.ends(Place::Learner, Exit::Code(STOPPED));
     world.settle();
     assert_eq!(world.over, Some(Outcome::Finished));
 }

@@ -180,9 +180,21 @@ impl Train {
 
     /// Waits for the end, which must be a good one; returns the summary.
     pub fn finish(self) -> Value {
+        self.end_with(0)
+    }
+
+    /// Waits for the end of a run that was asked to stop; returns the summary.
+    pub fn finish_stopped(self) -> Value {
+        let summary = self.end_with(3);
+        assert_eq!(summary["ended"], "stopped");
+        summary
+    }
+
+    /// Waits for the end, with this exit code; returns the summary.
+    pub fn end_with(self, code: i32) -> Value {
         let output = self.wait();
         let stderr = String::from_utf8_lossy(&output.stderr);
-        assert!(output.status.success(), "{:?}: {stderr}", output.status);
+        assert_eq!(output.status.code(), Some(code), "{stderr}");
         serde_json::from_slice(&output.stdout).unwrap()
     }
 }

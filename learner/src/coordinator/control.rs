@@ -1,6 +1,7 @@
 //! What people want of a run: pause, resume, stop, other settings.
 
 use super::{Coordinator, Effect};
+use crate::summary::Ended;
 use rit_config::Config;
 use rit_proto::v1::RunState;
 use std::sync::Arc;
@@ -25,13 +26,13 @@ impl Coordinator {
         }
     }
 
-    pub(super) fn stop(&mut self, drain: bool, effects: &mut Vec<Effect>) {
+    pub(super) fn stop(&mut self, drain: bool, ended: Ended, effects: &mut Vec<Effect>) {
         tracing::info!(drain, "asked to stop");
         self.happened("asked to stop".into());
         self.state = RunState::Stopping;
-        self.draining = drain;
+        self.draining = drain.then_some(ended);
         if !drain {
-            effects.push(Effect::EndTraining);
+            effects.push(Effect::EndTraining(ended));
         }
     }
 
@@ -43,9 +44,10 @@ impl Coordinator {
 
     /// Ends the run once nothing is under way any more; batches that are full are trained on first.
     pub(super) fn stop_if_drained(&mut self, effects: &mut Vec<Effect>) {
-        if self.draining && self.ledger.counts().outstanding == 0 {
-            self.draining = false;
-            effects.push(Effect::EndTraining);
+        if self.ledger.counts().outstanding == 0
+            && let Some(ended) = self.draining.take()
+        {
+            effects.push(Effect::EndTraining(ended));
         }
     }
 }

@@ -3,6 +3,7 @@
 use crate::{
     ledger::{ActorId, Terms},
     receive::Fence,
+    summary::Ended,
     trainer::News,
     writer::CheckpointEnded,
 };
@@ -44,6 +45,8 @@ pub enum Input {
     Stop {
         /// Whether episodes under way are waited for.
         drain: bool,
+        /// What the run then ends as.
+        ended: Ended,
     },
     /// Other settings from now on.
     Set(Arc<Config>),
@@ -99,7 +102,7 @@ pub enum Effect {
     /// Train with other settings.
     Configure(Arc<Config>),
     /// Train no more.
-    EndTraining,
+    EndTraining(Ended),
     /// Say when all that was sent by now has been read.
     Fence(Fence),
     /// The actors have gone, or were waited for long enough.

@@ -4,6 +4,7 @@ use super::{Coordinator, Effect, Input, Joining, LOOK_EVERY, Refusal};
 use crate::{
     ledger::{ActorId, Terms},
     receive::Fence,
+    summary::Ended,
     trainer::{Checkpointed, News, Work},
     writer::CheckpointEnded,
 };
@@ -73,6 +74,8 @@ pub enum Control {
     Stop {
         /// Whether episodes under way are waited for.
         drain: bool,
+        /// What the run then ends as.
+        ended: Ended,
         /// The way to answer.
         answer: oneshot::Sender<v1::RunStatus>,
     },
@@ -157,7 +160,7 @@ impl Shell {
             Control::Status(answer) => (None, answer),
             Control::Pause(answer) => (Some(Input::Pause), answer),
             Control::Resume(answer) => (Some(Input::Resume), answer),
-            Control::Stop { drain, answer } => (Some(Input::Stop { drain }), answer),
+            Control::Stop { drain, ended, answer } => (Some(Input::Stop { drain, ended }), answer),
             Control::Set(config, answer) => (Some(Input::Set(config)), answer),
         };
         if let Some(input) = input {
@@ -206,8 +209,8 @@ impl Shell {
             Effect::Configure(config) => {
                 let _ = self.work.send(Work::Set(config));
             }
-            Effect::EndTraining => {
-                let _ = self.work.send(Work::Stop);
+            Effect::EndTraining(ended) => {
+                let _ = self.work.send(Work::Stop(ended));
             }
             Effect::Fence(fence) => {
                 let _ = self.fences.send(fence);

@@ -5,6 +5,7 @@ use crate::{
     coordinator::Control,
     prometheus,
     run_handle::{AskError, Watched},
+    summary::Ended,
 };
 use axum::{
     Json, Router,
@@ -37,7 +38,9 @@ pub fn router() -> Router<Page> {
         .route("/api/resume", post(async |State(page)| tell(page, Control::Resume).await))
         .route(
             "/api/stop",
-            post(async |State(page)| tell(page, |answer| Control::Stop { drain: false, answer }).await),
+            post(async |State(page)| {
+                tell(page, |answer| Control::Stop { drain: false, ended: Ended::Stopped, answer }).await
+            }),
         )
         .route("/api/checkpoint", post(checkpoint))
         .route("/api/evaluate", post(evaluate))

@@ -13,6 +13,7 @@ use rit_learner::{
     coordinator::{Coordinator, Effect, Input, Joining, LOOK_EVERY, Refusal},
     ledger::{ActorId, Terms},
     receive::Fence,
+    summary::Ended,
     trainer::{Beginning, News, Standing},
     writer::CheckpointEnded,
 };
@@ -42,7 +43,7 @@ impl Saved {
 /// What the trainer is asked to do, one after another.
 enum Work {
     Batch(Vec<Episode>),
-    Stop,
+    Stop(Ended),
 }
 
 /// A learner that listens.
@@ -55,7 +56,7 @@ pub struct Learner {
     work: VecDeque<Work>,
     busy: bool,
     ending: bool,
-    failed: bool,
+    ended: Ended,
     closed: bool,
     /// By actor, the link it has.
     links: BTreeMap<ActorId, usize>,
@@ -122,7 +123,7 @@ impl<M: Machines> World<M> {
             work: VecDeque::new(),
             busy: false,
             ending: false,
-            failed: false,
+            ended: Ended::Finished,
             closed: false,
             links: BTreeMap::new(),
             joining: None,
@@ -132,7 +133,7 @@ impl<M: Machines> World<M> {
         });
         self.after(LOOK_EVERY, What::Look(life));
         if self.saved.batches >= self.plan.batches {
-            self.training_ends();
+            self.training_ends(Ended::Finished);
         }
     }
 
@@ -194,8 +195,8 @@ impl<M: Machines> World<M> {
                 learner.work.push_back(Work::Batch(batch));
                 self.train_on();
             }
-            Effect::EndTraining => {
-                learner.work.push_back(Work::Stop);
+            Effect::EndTraining(ended) => {
+                learner.work.push_back(Work::Stop(ended));
                 self.train_on();
             }
             Effect::Configure(_) => {}
@@ -205,7 +206,7 @@ impl<M: Machines> World<M> {
             }
             Effect::Close => {
                 learner.closed = true;
-                let (life, exit) = (learner.life, Exit::Code(i32::from(learner.failed)));
+                let (life, exit) = (learner.life, Exit::Code(i32::from(learner.ended.exit_code())));
                 let delay = self.latency();
                 self.after(delay, What::Dies(life, exit));
             }
@@ -264,7 +265,7 @@ impl<M: Machines> World<M> {
                 let time = self.millis(1..60);
                 self.after(time, What::Trained(life));
             }
-            Some(Work::Stop) => self.training_ends(),
+            Some(&Work::Stop(ended)) => self.training_ends(ended),
             None => {}
         }
     }
@@ -297,7 +298,7 @@ impl<M: Machines> World<M> {
         self.tell(Input::News(News::Trained(terms, standing)));
         let Some(learner) = &self.learner else { return };
         if learner.state.batches >= self.plan.batches {
-            self.training_ends();
+            self.training_ends(Ended::Finished);
         } else if learner.state.batches.is_multiple_of(self.plan.checkpoint_every_batches) {
             let state = Box::new(learner.state.clone());
             self.writes(1..200, What::Written(life, state));
@@ -328,11 +329,12 @@ impl<M: Machines> World<M> {
         }));
     }
 
-    fn training_ends(&mut self) {
+    fn training_ends(&mut self, ended: Ended) {
         let Some(learner) = &mut self.learner else { return };
         if std::mem::replace(&mut learner.ending, true) {
             return;
         }
+        learner.ended = ended;
         let life = learner.life;
         self.tell(Input::News(News::Ending));
         self.writes(1..2000, What::Finished(life));
@@ -351,8 +353,8 @@ impl<M: Machines> World<M> {
     pub fn finished(&mut self) {
         let full = self.now < self.disk_full_until;
         let Some(learner) = &mut self.learner else { return };
-        learner.failed = full;
         if full {
+            learner.ended = Ended::Failed;
             self.may_fail = true;
         } else {
             self.saved = learner.state.clone();

@@ -14,6 +14,7 @@ use rit_learner::{
     coordinator::{Input, Joining, STANDSTILL_AFTER},
     ledger::ActorId,
     receive::Fence,
+    summary::Ended,
 };
 use rit_proto::v1::RunState;
 use std::{
@@ -381,7 +382,9 @@ impl<M: Machines> World<M> {
             What::Reaped(supervisor, place, exit) => self.reaped(supervisor, place, exit),
             What::Asked(process) => self.is_asked(process),
             What::Control(Control::Resume) => self.learner_is_asked(Input::Resume),
-            What::Control(Control::Stop { drain }) => self.learner_is_asked(Input::Stop { drain }),
+            What::Control(Control::Stop { drain }) => {
+                self.learner_is_asked(Input::Stop { drain, ended: Ended::Stopped })
+            }
             What::Look(life) => self.look(life),
             What::Trained(life) => self.trained(life),
             What::Written(_, state) => self.written(&state),
@@ -561,7 +564,7 @@ impl<M: Machines> World<M> {
         match self.processes[process].place {
             Place::Actor(_) => self.leaves(process),
             Place::Learner if self.learner.is_some() => {
-                self.learner_is_asked(Input::Stop { drain: false });
+                self.learner_is_asked(Input::Stop { drain: false, ended: Ended::Interrupted });
             }
             // It hears of it once it has begun.
             Place::Learner => {

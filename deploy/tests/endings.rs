@@ -1,0 +1,112 @@
+//! How a run ended: `summary.json` and the exit code say the same, and scripts can tell the ends apart.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "helpers of tests are tests too")]
+
+mod common;
+
+use common::{RunFolder, Train, actor_pid, kill, learner_pid, output, rit, wait_until_gone};
+use rustix::process::Signal;
+use serde_json::Value;
+use std::{fs, process::Stdio};
+
+const RUN: &[&str] = &[
+    "matrix-game",
+    "--seed",
+    "3",
+    "--steps",
+    "1000000",
+    "--actors",
+    "1",
+    "--set",
+    "evaluation.episodes=2",
+    "--set",
+    "checkpoints.every_env_steps=60",
+    "--set",
+    "web.listen=off",
+];
+
+fn summary(folder: &RunFolder) -> Value {
+    serde_json::from_slice(&fs::read(folder.run_dir().join("summary.json")).unwrap()).unwrap()
+}
+
+fn under_way(folder: &RunFolder, more: &[&str]) -> Train {
+    let mut train = folder.start(&[RUN, more].concat());
+    train.wait_for("training", |status| status["updates"].as_u64() > Some(20));
+    train
+}
+
+#[test]
+fn a_run_that_has_done_its_steps_or_reached_its_goal_has_finished() {
+    let folder = RunFolder::new();
+    let ended = folder.start(&[RUN, &["--steps", "200"]].concat()).end_with(0);
+    assert_eq!(ended["ended"], "finished");
+    assert_eq!(ended, summary(&folder));
+    let folder = RunFolder::new();
+    let goal = ["--until", "mean_return=-1000", "--set", "evaluation.every_env_steps=50"];
+    let ended = folder.start(&[RUN, &goal].concat()).end_with(0);
+    assert_eq!(ended["ended"], "until");
+}
+
+#[test]
+fn a_run_that_was_asked_to_end_says_by_whom() {
+    let folder = RunFolder::new();
+    let train = under_way(&folder, &[]);
+    assert!(train.ctl(&["stop"]).status.success());
+    train.finish_stopped();
+    assert_eq!(summary(&folder)["ended"], "stopped");
+
+    // While it goes on there is no end to tell of.
+    let mut again = Train::resume(&folder, &[]);
+    again.wait_for("training", |status| status["updates"].as_u64() > Some(20));
+    assert!(!folder.run_dir().join("summary.json").exists());
+    again.signal(Signal::TERM);
+    assert_eq!(again.end_with(130)["ended"], "interrupted");
+    let status = output(&["ctl", "--run", folder.run_dir().to_str().unwrap(), "status"]);
+    let status = String::from_utf8(status.stdout).unwrap();
+    assert!(status.starts_with("the run is over (interrupted)"), "{status}");
+}
+
+#[test]
+fn a_learner_that_is_asked_to_end_alone_is_restarted() {
+    for signal in [Signal::TERM, Signal::INT] {
+        let folder = RunFolder::new();
+        let mut train = under_way(&folder, &[]);
+        let first = learner_pid(&train.wait_for("the learner", |_| true));
+        kill(first, signal);
+        let after = train.wait_for("the next learner and the actor", |status| {
+            learner_pid(status) != first && actor_pid(status, "actor-0").is_some()
+        });
+        train.wait_for("progress", |status| status["updates"].as_u64() > after["updates"].as_u64());
+        train.signal(Signal::INT);
+        assert_eq!(train.end_with(130)["ended"], "interrupted");
+    }
+}
+
+#[test]
+fn a_learner_of_its_own_ends_as_interrupted() {
+    let folder = RunFolder::new();
+    let run_dir = folder.run_dir();
+    let run = run_dir.to_str().unwrap();
+    let mut command = rit(&["learner", "--new", "matrix-game", "--run-dir", run, "--set", "web.listen=off"]);
+    let mut learner = command.stderr(Stdio::null()).spawn().unwrap();
+    while !run_dir.join("address").exists() {
+        assert!(learner.try_wait().unwrap().is_none(), "it listens");
+        std::thread::yield_now();
+    }
+    kill(learner.id(), Signal::TERM);
+    assert_eq!(learner.wait().unwrap().code(), Some(130));
+    assert_eq!(summary(&folder)["ended"], "interrupted");
+}
+
+#[test]
+fn a_run_that_is_given_up_has_failed_and_says_why() {
+    let folder = RunFolder::new();
+    let mut train = folder.start(&[RUN, &["--set", "algorithm.lr=1e30"]].concat());
+    let status = train.wait_for("the learner", |_| true);
+    let output = train.wait();
+    assert_eq!(output.status.code(), Some(1), "{}", String::from_utf8_lossy(&output.stderr));
+    let ended = summary(&folder);
+    assert_eq!(ended["ended"], "failed");
+    assert!(ended["reason"].as_str().unwrap().contains("not finite"), "{ended}");
+    assert!(ended["updates"].as_u64() > Some(0), "{ended}");
+    wait_until_gone(learner_pid(&status));
+}
