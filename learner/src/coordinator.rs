@@ -29,7 +29,6 @@ use std::{collections::BTreeMap, time::Duration};
 
 pub use messages::{Effect, Input, Joining, Refusal};
 pub use shell::{ACTOR_QUEUE, Control, Event, Shell};
-pub use standstill::STANDSTILL_AFTER;
 
 /// How long the end of a run waits for actors to go.
 const FAREWELL_TIMEOUT: Duration = Duration::from_secs(5);
@@ -81,6 +80,8 @@ pub struct Coordinator {
     looked: Duration,
     /// When something went on last.
     moved_at: Duration,
+    /// Actors that joined since.
+    joins: u32,
     /// Why nothing goes on, once that was said.
     stands_still: Option<String>,
     /// When the trainer was done.
@@ -139,6 +140,7 @@ impl Coordinator {
             now: Duration::ZERO,
             looked: Duration::ZERO,
             moved_at: Duration::ZERO,
+            joins: 0,
             stands_still: None,
             over_since: None,
             config,

@@ -253,6 +253,7 @@ pub struct Learner {
     pub shards: usize,
     pub threads: usize,
     pub metrics_every_env_steps: u64,
+    pub stall_timeout_ms: u64,
 }
 
 /// `[learner.tls]`. An empty path is none.
@@ -522,6 +523,7 @@ impl Config {
             ("learner.shards", self.learner.shards.into(), 1.0, 256.0),
             ("learner.threads", self.learner.threads.into(), 1.0, 256.0),
             ("learner.metrics_every_env_steps", self.learner.metrics_every_env_steps.into(), 1.0, STEPS),
+            ("learner.stall_timeout_ms", self.learner.stall_timeout_ms.into(), 1000.0, 86_400_000.0),
         ]
     }
 }

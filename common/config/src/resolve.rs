@@ -99,7 +99,7 @@ pub fn key_like(name: &str) -> Option<String> {
 }
 
 /// Keys, or sections, that a run may change when it goes on: no weight follows from them.
-const FREE: [&str; 10] = [
+const FREE: [&str; 11] = [
     "training",
     "evaluation",
     "checkpoints",
@@ -109,12 +109,13 @@ const FREE: [&str; 10] = [
     "learner.tls",
     "learner.threads",
     "learner.metrics_every_env_steps",
+    "learner.stall_timeout_ms",
     "web",
 ];
 
 /// Keys that a running learner can change. Of these `algorithm.epsilon_finish` changes the
 /// result, and `evaluation` does where `training.until` ends the run at an evaluation.
-pub(crate) const LIVE: [&str; 9] = [
+pub(crate) const LIVE: [&str; 10] = [
     "algorithm.epsilon_finish",
     "evaluation.every_env_steps",
     "evaluation.episodes",
@@ -124,6 +125,7 @@ pub(crate) const LIVE: [&str; 9] = [
     "actors.count",
     "actors.heartbeat_timeout_ms",
     "learner.metrics_every_env_steps",
+    "learner.stall_timeout_ms",
 ];
 
 /// The configuration of a running learner with these settings.
@@ -428,8 +430,8 @@ mod tests {
             ("learner.gamma=0.9", "unknown key \"learner.gamma\"; did you mean algorithm.gamma?"),
             (
                 "learner.device=cuda",
-                "unknown key \"learner.device\"; [learner] has listen, metrics_every_env_steps, shards, threads, \
-                 tls, token_file",
+                "unknown key \"learner.device\"; [learner] has listen, metrics_every_env_steps, shards, \
+                 stall_timeout_ms, threads, tls, token_file",
             ),
             ("zzz.qqq=1", "unknown key \"zzz.qqq\"; a key is one of actors, algorithm,"),
             ("seed\n8=1", "unknown key \"seed\\n8\"; "),

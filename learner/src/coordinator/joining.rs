@@ -45,6 +45,7 @@ impl Coordinator {
         }
         let id = self.next_actor;
         self.next_actor += 1;
+        self.joins += 1;
         tracing::info!(name, pid, remote, actor = id, "an actor joined");
         self.happened(format!("{name} joined"));
         let actor = Actor {

@@ -4,13 +4,14 @@ use super::Coordinator;
 use rit_proto::v1::RunState;
 use std::time::Duration;
 
-/// A run that is not paused and makes no step for so long stands still.
-pub const STANDSTILL_AFTER: Duration = Duration::from_secs(60);
+/// Joins without an episode between them that are no accident any more.
+const REJOINS: u32 = 3;
 
 impl Coordinator {
     /// Something went on: an episode came, a batch is done, or somebody let the run go on.
     pub(super) fn moved(&mut self) {
         self.moved_at = self.now;
+        self.joins = 0;
         if self.stands_still.take().is_some() {
             self.warned("the run goes on".into());
         }
@@ -26,20 +27,26 @@ impl Coordinator {
             return;
         }
         let still = self.now.saturating_sub(self.moved_at);
-        if still >= STANDSTILL_AFTER {
+        if still >= Duration::from_millis(self.config.learner.stall_timeout_ms) {
             let why = self.why_still();
             self.warned(format!("no step for {} s: {why}", still.as_secs()));
             self.stands_still = Some(why);
         }
     }
 
+    /// Why it stands. Processes of this host say more in their logs.
     fn why_still(&self) -> String {
         let (all, outstanding) = (self.actors.len(), self.ledger.counts().outstanding);
         let hung = self.actors.values().filter(|actor| actor.hung).count();
         if self.batches_in_training > 0 {
             "training is busy with one batch or an evaluation".into()
+        } else if self.joins >= REJOINS {
+            format!(
+                "actors joined {} times and brought nothing; logs/actor-0.log and others say why",
+                self.joins
+            )
         } else if all == 0 {
-            "no actor is there".into()
+            "no actor is there; logs/actor-0.log and others say why".into()
         } else if hung == all {
             format!("no sign of life from any of {all} actors")
         } else if outstanding > 0 {

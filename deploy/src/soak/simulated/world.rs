@@ -11,7 +11,7 @@ use rand::RngExt as _;
 use rit_config::Config;
 use rit_episode::{Rng, RunSeed, Stream};
 use rit_learner::{
-    coordinator::{Input, Joining, STANDSTILL_AFTER},
+    coordinator::{Input, Joining},
     ledger::ActorId,
     receive::Fence,
     summary::Ended,
@@ -613,7 +613,7 @@ impl<M: Machines> World<M> {
         if names.len() != status.actors.len() {
             self.breaks(format!("the learner counts a slot twice: {:?}", status.actors));
         } else if status.state() == RunState::Running
-            && stands > STANDSTILL_AFTER + Duration::from_secs(60)
+            && stands > Duration::from_millis(self.config.learner.stall_timeout_ms) + Duration::from_secs(60)
             && !says
         {
             self.breaks(format!("the run stands still for {} s and does not say why", stands.as_secs()));
