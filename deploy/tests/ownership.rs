@@ -223,9 +223,10 @@ fn a_learner_without_its_supervisor_keeps_the_run_until_it_has_ended() {
     train.signal(Signal::KILL);
     // Its learner now writes a last checkpoint; the next one waits for that, and goes on from it.
     let mut next = Train::resume(&folder, &[]);
-    let after = under_way(&mut next);
+    let after = next.wait_for("the next learner, at work", |now| {
+        learner_pid(now) != learner_pid(&status) && actor_pid(now, "actor-0").is_some()
+    });
     assert!(after["env_steps"].as_u64() >= status["env_steps"].as_u64(), "{after}");
-    assert_ne!(learner_pid(&after), learner_pid(&status));
     next.signal(Signal::INT);
     assert_eq!(next.wait().status.code(), Some(130));
     assert!(shared_memory_of(&folder.run_dir()).is_empty());

@@ -383,7 +383,7 @@ impl<M: Machines> World<M> {
             What::Asked(process) => self.is_asked(process),
             What::Control(Control::Resume) => self.learner_is_asked(Input::Resume),
             What::Control(Control::Stop { drain }) => {
-                self.learner_is_asked(Input::Stop { drain, ended: Ended::Stopped })
+                self.learner_is_asked(Input::Stop { drain, ended: Ended::Stopped });
             }
             What::Look(life) => self.look(life),
             What::Trained(life) => self.trained(life),
