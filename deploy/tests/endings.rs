@@ -62,7 +62,7 @@ fn a_run_that_was_asked_to_end_says_by_whom() {
     assert_eq!(again.end_with(130)["ended"], "interrupted");
     let status = output(&["ctl", "--run", folder.run_dir().to_str().unwrap(), "status"]);
     let status = String::from_utf8(status.stdout).unwrap();
-    assert!(status.starts_with("the run is over (interrupted)"), "{status}");
+    assert!(status.starts_with("the run is over: interrupted"), "{status}");
 }
 
 #[test]
