@@ -2,8 +2,8 @@
 
 use crate::{cli::ConfigOptions, failure::Failure, output};
 use rit_algo::Method;
-use rit_config::{Config, resolve, set};
-use std::{fs, path::Path, process::ExitCode};
+use rit_config::{Config, read_text, resolve, set};
+use std::{path::Path, process::ExitCode};
 use toml::Table;
 
 /// Name and text of each, from `deploy/experiments/`.
@@ -65,8 +65,7 @@ pub fn load(experiment: &str, settings: &[String]) -> Result<Experiment, Failure
     if path.extension().is_none_or(|extension| extension != "toml") {
         return Err(unknown(experiment));
     }
-    let text =
-        fs::read_to_string(path).map_err(|error| Failure::input_message(format!("{experiment}: {error}")))?;
+    let text = read_text(path).map_err(|error| Failure::input_message(format!("{experiment}: {error}")))?;
     let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     Ok(Experiment { name, config: resolve(&text, experiment, &settings)? })
 }
@@ -115,7 +114,7 @@ mod tests {
         for (name, _) in EXPERIMENTS {
             assert_eq!(load(name, &[]).unwrap().name, name);
         }
-        let files = fs::read_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/experiments")).unwrap();
+        let files = std::fs::read_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/experiments")).unwrap();
         assert_eq!(files.count(), EXPERIMENTS.len(), "every file is embedded");
     }
 }

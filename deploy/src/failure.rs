@@ -4,7 +4,9 @@ use crate::output;
 use rit_actor::ActorError;
 use rit_config::{ConfigError, RunDirError};
 use rit_env::{TaskError, UnfitScript, UnknownName, rollout::LostEpisode};
-use rit_learner::{LearnerError, evaluation::TasksError, weights_file::WeightsFileError};
+use rit_learner::{
+    LearnerError, evaluation::TasksError, trainer::TrainError, weights_file::WeightsFileError,
+};
 use rit_proto::transport::{ConnectError, CredentialsError, status_words};
 use std::{fmt, process::ExitCode};
 
@@ -150,7 +152,8 @@ impl From<LearnerError> for Failure {
             LearnerError::Access(_)
             | LearnerError::Address(_)
             | LearnerError::Model(_)
-            | LearnerError::Checkpoint(_) => Self::input(error),
+            | LearnerError::Checkpoint(_)
+            | LearnerError::Train(TrainError::Metrics { .. }) => Self::input(error),
             _ => Self::runtime(error),
         }
     }

@@ -45,6 +45,13 @@ fn what_is_typed_wrong_is_named() {
     train(&[file.to_str().unwrap()], &["unknown key \"network.hiden_dim\"", "network.hidden_dim"]);
     fs::write(&file, "environment.task_set = \"matrix-game\"\n\nseed = = 3").unwrap();
     train(&[file.to_str().unwrap()], &["mine.toml, line 3, column 8: "]);
+    // What is no file is not waited for.
+    let (pipe, endless) = (folder.path().join("pipe.toml"), folder.path().join("endless.toml"));
+    rustix::fs::mkfifoat(rustix::fs::CWD, &pipe, rustix::fs::Mode::RWXU).unwrap();
+    std::os::unix::fs::symlink("/dev/zero", &endless).unwrap();
+    for file in [pipe, endless] {
+        train(&[file.to_str().unwrap()], &[".toml: it is no regular file"]);
+    }
 }
 
 #[test]

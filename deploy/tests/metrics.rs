@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{RunFolder, json_lines, learner_pid, output, rit};
+use common::{RunFolder, learner_pid, metrics_lines, output, rit};
 use rit_config::RunDir;
 use rit_proto::{
     transport::{self, Client, Credentials},
@@ -35,7 +35,7 @@ fn a_follower_gets_every_line_until_the_run_is_over() {
     assert!(followed.status.success(), "{}", String::from_utf8_lossy(&followed.stderr));
     let text = String::from_utf8(followed.stdout).unwrap();
     let followed: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
-    let mut written = json_lines(&run_dir.join("metrics.jsonl"));
+    let mut written = metrics_lines(&run_dir);
     written.retain(|line| line["env_steps"].as_u64() >= Some(100));
     assert_eq!((followed.len(), written.len()), (451, 451));
     for (line, written) in followed.iter().zip(&written) {

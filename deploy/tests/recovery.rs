@@ -4,7 +4,7 @@
 mod common;
 
 use common::{
-    RunFolder, Train, actor_pid, json_lines, kill, learner_pid, output, pids, rit, shared_memory_of,
+    RunFolder, Train, actor_pid, kill, learner_pid, metrics_lines, output, pids, rit, shared_memory_of,
     wait_until_gone,
 };
 use rustix::process::Signal;
@@ -41,17 +41,17 @@ static UNDISTURBED: LazyLock<(Value, Vec<Value>)> = LazyLock::new(|| {
 });
 
 fn metrics(folder: &RunFolder) -> Vec<Value> {
-    let mut lines = json_lines(&folder.run_dir().join("metrics.jsonl"));
+    let mut lines = metrics_lines(&folder.run_dir());
     for line in &mut lines {
         line.as_object_mut().unwrap().remove("wall_s");
     }
     lines
 }
 
-/// Events in TensorBoard's files but for the two that each file begins with.
+/// Events in TensorBoard's files but for the three that each file begins with.
 fn tensorboard_events(folder: &RunFolder) -> usize {
     let files = fs::read_dir(folder.run_dir().join("tensorboard")).unwrap();
-    files.map(|file| count_records(&fs::read(file.unwrap().path()).unwrap()) - 2).sum()
+    files.map(|file| count_records(&fs::read(file.unwrap().path()).unwrap()) - 3).sum()
 }
 
 /// Records of a length, its checksum, data, its checksum.
@@ -243,6 +243,39 @@ fn what_would_change_the_result_cannot_change() {
     assert_eq!(refused.status.code(), Some(2));
     let stderr = String::from_utf8_lossy(&refused.stderr);
     assert!(stderr.contains("algorithm.gamma cannot change in a run that has begun"), "{stderr}");
+}
+
+#[test]
+fn torn_metrics_are_repaired_at_the_last_whole_line_and_it_is_said() {
+    let folder = RunFolder::new();
+    folder.train(&[RUN, &["--steps", "300"]].concat());
+    let run_dir = folder.run_dir();
+    let path = run_dir.join("metrics.jsonl");
+    let whole = fs::read_to_string(&path).unwrap();
+    let lines: Vec<&str> = whole.split_inclusive('\n').collect();
+    assert!(lines.len() > 2, "{whole}");
+    let (last, before) = lines.split_last().unwrap();
+    fs::write(&path, before.concat() + &last[..last.len() / 2]).unwrap();
+    for entry in fs::read_dir(run_dir.join("tensorboard")).unwrap() {
+        let path = entry.unwrap().path();
+        let bytes = fs::read(&path).unwrap();
+        fs::write(&path, &bytes[..bytes.len() - 3]).unwrap();
+    }
+    let resumed = output(&["train", "--resume", run_dir.to_str().unwrap(), "--steps", "800"]);
+    let stderr = String::from_utf8_lossy(&resumed.stderr);
+    assert!(resumed.status.success(), "{stderr}");
+    for said in
+        ["lines are missing, it goes on behind its last whole one", "it is cut behind its last whole one"]
+    {
+        assert!(stderr.contains(said), "{stderr}");
+    }
+    let (_, undisturbed) = &*UNDISTURBED;
+    let lost: Value = serde_json::from_str(last).unwrap();
+    let kept = undisturbed
+        .iter()
+        .filter(|line| (&line["kind"], &line["env_steps"]) != (&lost["kind"], &lost["env_steps"]));
+    assert!(metrics(&folder).iter().eq(kept), "every other line is there once");
+    assert_eq!(tensorboard_events(&folder), undisturbed.len() - 1);
 }
 
 /// What was done to a run directory after it was trained in, and what is said of it; nothing is trained anew.

@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{RunFolder, Train, json_lines, pids, shared_memory_of, wait_until_gone};
+use common::{RunFolder, Train, metrics_lines, pids, shared_memory_of, wait_until_gone};
 use rustix::process::Signal;
 use serde_json::Value;
 use std::os::unix::fs::PermissionsExt as _;
@@ -44,7 +44,7 @@ fn two_actors_and_a_learner_train_and_leave_a_whole_run_directory() {
         serde_json::from_slice(&std::fs::read(run_dir.join("summary.json")).unwrap()).unwrap();
     assert_eq!(on_disk, summary);
     assert!(run_dir.join("checkpoints/latest/weights.safetensors").is_file());
-    let lines = json_lines(&run_dir.join("metrics.jsonl"));
+    let lines = metrics_lines(&run_dir);
     let of_kind = |kind: &str| lines.iter().filter(|line| line["kind"] == kind).count();
     assert_eq!((of_kind("training"), of_kind("evaluation")), (6, 1));
     assert_eq!(std::fs::metadata(&run_dir).unwrap().permissions().mode() & 0o777, 0o700);

@@ -154,6 +154,7 @@ impl From<AskError> for Status {
         let message = error.to_string();
         match error {
             AskError::Over => Self::unavailable(message),
+            AskError::Busy => Self::resource_exhausted(message),
             AskError::Task(_)
             | AskError::Tasks(_)
             | AskError::Episodes(_)

@@ -115,7 +115,8 @@ impl Evaluator {
         if is_testing { self.testing_episodes } else { self.episodes }
     }
 
-    /// The tasks of `training`, `testing`, or of names of tasks; the training tasks where nothing is named.
+    /// The tasks of `training`, `testing`, or of names of tasks, each once however often it is
+    /// named; the training tasks where nothing is named.
     ///
     /// # Errors
     /// When a name means nothing, or there are no testing tasks.
@@ -124,16 +125,21 @@ impl Evaluator {
         if names.is_empty() {
             return Ok(training.clone());
         }
-        let mut tasks = Vec::new();
+        let mut tasks: Vec<Task> = Vec::new();
         for name in names {
-            match name.as_str() {
-                "training" => tasks.extend(training),
+            let named = match name.as_str() {
+                "training" => training.clone(),
                 "testing" if testing.is_empty() => {
                     let known = training.iter().map(Task::to_string).collect();
                     return Err(TasksError::NoTesting { task_set: self.task_set, known });
                 }
-                "testing" => tasks.extend(testing),
-                name => tasks.push(self.task_set.task(name)?),
+                "testing" => testing.clone(),
+                name => vec![self.task_set.task(name)?],
+            };
+            for task in named {
+                if !tasks.contains(&task) {
+                    tasks.push(task);
+                }
             }
         }
         Ok(tasks)
@@ -150,12 +156,8 @@ impl Evaluator {
         asked: Option<usize>,
         seed: RunSeed,
     ) -> Result<Vec<TaskResult>, LostEpisode> {
-        let mut results = Vec::with_capacity(tasks.len());
-        for &task in tasks {
-            let episodes = asked.unwrap_or_else(|| self.own_episodes(task));
-            results.extend(self.evaluate(policy, &[task], episodes, seed)?);
-        }
-        Ok(results)
+        // Nobody gives it up.
+        self.evaluate_unless(policy, tasks, asked, seed, &|| false).map(Option::unwrap_or_default)
     }
 
     /// Rolls so many greedy episodes of each task. The same seed rolls the same episodes.
@@ -169,7 +171,30 @@ impl Evaluator {
         episodes: usize,
         seed: RunSeed,
     ) -> Result<Vec<TaskResult>, LostEpisode> {
-        tasks.iter().map(|&task| self.evaluate_task(policy, task, episodes, seed)).collect()
+        self.evaluate_own(policy, tasks, Some(episodes), seed)
+    }
+
+    /// [`Self::evaluate_own`], given up within a few episodes once nobody wants it any more: then `None`.
+    ///
+    /// # Errors
+    /// When an environment cannot go on.
+    pub fn evaluate_unless(
+        &self,
+        policy: &mut dyn Policy,
+        tasks: &[Task],
+        asked: Option<usize>,
+        seed: RunSeed,
+        given_up: &dyn Fn() -> bool,
+    ) -> Result<Option<Vec<TaskResult>>, LostEpisode> {
+        let mut results = Vec::with_capacity(tasks.len());
+        for &task in tasks {
+            let episodes = asked.unwrap_or_else(|| self.own_episodes(task));
+            let Some(result) = self.evaluate_task(policy, task, episodes, seed, given_up)? else {
+                return Ok(None);
+            };
+            results.push(result);
+        }
+        Ok(Some(results))
     }
 
     /// Rolls those episodes of these numbers that [`Self::evaluate`] rolls of a task with this seed, and shows
@@ -199,23 +224,28 @@ impl Evaluator {
         task: Task,
         episodes: usize,
         seed: RunSeed,
-    ) -> Result<TaskResult, LostEpisode> {
+        given_up: &dyn Fn() -> bool,
+    ) -> Result<Option<TaskResult>, LostEpisode> {
         let mut rollout = self.rollout(task, seed);
         let (mut total, mut won) = (0.0, 0);
-        for jobs in jobs(0..episodes as u64).chunks(SIDE_BY_SIDE) {
-            for episode in all_rolled(rollout.roll(policy, jobs))? {
+        for begin in (0..episodes as u64).step_by(SIDE_BY_SIDE) {
+            if given_up() {
+                return Ok(None);
+            }
+            let numbers = begin..(begin + SIDE_BY_SIDE as u64).min(episodes as u64);
+            for episode in all_rolled(rollout.roll(policy, &jobs(numbers)))? {
                 total += episode.total_reward();
                 won += usize::from(episode.won);
             }
         }
         let share = |sum: f64| sum / episodes as f64;
-        Ok(TaskResult {
+        Ok(Some(TaskResult {
             task: task.to_string(),
             episodes: episodes as u64,
             mean_return: share(total),
             win_rate: task.spec().has_wins.then(|| share(won as f64)),
             exploring: None,
-        })
+        }))
     }
 }
 
@@ -277,6 +307,28 @@ mod tests {
         assert_eq!(training, evaluator.tasks(&[]).unwrap().len());
         assert_eq!((training + testing, testing > 0), (tasks.len(), true));
         assert_eq!(counts(Some(1)), vec![1; tasks.len()]);
+    }
+
+    #[test]
+    fn a_task_that_is_named_again_and_again_is_one_task() {
+        let config = rit_config::resolve("environment.task_set = \"matrix-game\"", "test", &[]).unwrap();
+        let evaluator = Evaluator::new(&config);
+        let mut names = vec!["game-2".to_owned(); 3000];
+        names.extend(["training".to_owned(), "game-3".to_owned()]);
+        let tasks: Vec<_> = evaluator.tasks(&names).unwrap().iter().map(ToString::to_string).collect();
+        assert_eq!(tasks, ["game-2", "game-1", "game-3", "game-4"]);
+    }
+
+    #[test]
+    fn what_nobody_wants_any_more_ends_within_a_few_episodes() {
+        let config = rit_config::resolve("environment.task_set = \"matrix-game\"", "test", &[]).unwrap();
+        let evaluator = Evaluator::new(&config);
+        let tasks = evaluator.tasks(&[]).unwrap();
+        let looks = std::cell::Cell::new(0);
+        let given_up = || looks.replace(looks.get() + 1) == 3;
+        let results =
+            evaluator.evaluate_unless(&mut FirstAction, &tasks, Some(1_000_000_000), RunSeed(1), &given_up);
+        assert!(results.unwrap().is_none() && looks.get() == 4, "{}", looks.get());
     }
 
     #[test]

@@ -16,6 +16,7 @@ pub mod ledger;
 pub mod life;
 pub mod measured;
 pub mod metrics;
+pub mod metrics_repair;
 pub mod prometheus;
 pub mod receive;
 pub mod replay;
@@ -29,6 +30,7 @@ pub mod trainer;
 pub mod web;
 pub mod weights;
 pub mod weights_file;
+pub mod write_queue;
 pub mod writer;
 
 pub use run::{LearnerError, expected, run};

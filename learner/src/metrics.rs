@@ -6,6 +6,7 @@ use crate::{
     checkpoint::Progress,
     evaluation::{Exploring, TaskResult},
     measured::Measured,
+    metrics_repair::{End, Header, MetricsError, is_header, repair},
 };
 use rit_episode::Episode;
 use rit_proto::v1;
@@ -172,16 +173,26 @@ pub struct MetricsFile {
 }
 
 impl MetricsFile {
-    /// Begins the file, or goes on behind its first `len` bytes: what lies behind them was written by a learner
-    /// that died, and will be written again. `before_s` are the seconds that learners ran before.
+    /// Begins the file, or goes on behind the `end` that a checkpoint remembers: what lies behind it was written by a
+    /// learner that died, and will be written again. `before_s` are the seconds that learners ran before. Returns what
+    /// somebody should know of it too, if it had to be repaired.
     ///
     /// # Errors
-    /// When it cannot be written.
-    pub fn open(path: &Path, len: u64, before_s: f64) -> io::Result<Self> {
+    /// When it is of another run or build, or cannot be written.
+    pub fn open(
+        path: &Path,
+        header: &Header,
+        end: Option<End>,
+        before_s: f64,
+    ) -> Result<(Self, Option<String>), MetricsError> {
+        let (len, warning) = end.map_or(Ok((0, None)), |end| repair(path, header, end))?;
         let file = OpenOptions::new().create(true).truncate(false).write(true).open(path)?;
-        let file = AppendFile::new(path.to_owned(), file, len)?;
+        let mut file = AppendFile::new(path.to_owned(), file, len)?;
+        if len == 0 {
+            file.append(&header.line()?);
+        }
         let len = watch::Sender::new(file.written());
-        Ok(Self { path: path.to_owned(), file, len, started: Instant::now(), before_s })
+        Ok((Self { path: path.to_owned(), file, len, started: Instant::now(), before_s }, warning))
     }
 
     /// Seconds that learners have run, this one and those before.
@@ -250,7 +261,8 @@ impl Follower {
         file.take(CHUNK.min(len.saturating_sub(self.at))).read_to_end(&mut text)?;
         let whole = text.iter().rposition(|&byte| byte == b'\n').map_or(0, |at| at + 1);
         self.at += whole as u64;
-        let lines = text[..whole].split(|&byte| byte == b'\n').filter(|line| !line.is_empty());
+        let lines =
+            text[..whole].split(|&byte| byte == b'\n').filter(|line| !line.is_empty() && !is_header(line));
         lines.map(|line| serde_json::from_slice(line).map_err(io::Error::from)).collect()
     }
 
@@ -288,25 +300,35 @@ mod tests {
         }
     }
 
+    fn open(path: &Path, end: Option<End>, before_s: f64) -> MetricsFile {
+        let (file, warning) = MetricsFile::open(path, &Header::of_test(), end, before_s).unwrap();
+        assert_eq!(warning, None);
+        file
+    }
+
     #[test]
     fn a_resumed_file_forgets_what_the_dead_learner_wrote_last() {
         let file = tempfile::NamedTempFile::new().unwrap();
-        let mut first = MetricsFile::open(file.path(), 0, 0.0).unwrap();
+        let mut first = open(file.path(), None, 0.0);
         first.write(&line(1)).unwrap();
-        let at_checkpoint = first.len();
+        let at_checkpoint = End { env_steps: 1, len: first.len() };
         first.write(&line(2)).unwrap();
-        let mut second = MetricsFile::open(file.path(), at_checkpoint, 100.0).unwrap();
+        let mut second = open(file.path(), Some(at_checkpoint), 100.0);
         second.write(&line(3)).unwrap();
         assert!(second.wall_s() >= 100.0);
         let lines = second.follower().read().unwrap();
         assert_eq!(lines, [line(1), line(3)]);
         assert_eq!(second.len(), fs::metadata(file.path()).unwrap().len());
+        let text = fs::read_to_string(file.path()).unwrap();
+        assert_eq!(text.lines().next(), Some(r#"{"kind":"run","format_version":1,"run_id":"ab"}"#));
+        // One that begins anew keeps nothing.
+        assert!(open(file.path(), None, 0.0).follower().read().unwrap().is_empty());
     }
 
     #[tokio::test]
     async fn a_follower_reads_every_line_once_and_sees_the_end() {
         let file = tempfile::NamedTempFile::new().unwrap();
-        let mut metrics = MetricsFile::open(file.path(), 0, 0.0).unwrap();
+        let mut metrics = open(file.path(), None, 0.0);
         // More than is read at a time.
         let many = 5000;
         for env_steps in 0..many {

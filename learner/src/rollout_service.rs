@@ -11,6 +11,21 @@ use tonic::{Request, Response, Status, Streaming};
 #[derive(Clone, Debug)]
 pub struct RolloutService(pub mpsc::Sender<Event>);
 
+/// Longest name of an actor, in bytes.
+const NAME_BYTES_MAX: usize = 64;
+
+/// Names are shown on terminals and pages and stand in logs: they are short and of characters that do nothing there.
+fn check_name(name: &str) -> Result<(), Status> {
+    let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte);
+    if (1..=NAME_BYTES_MAX).contains(&name.len()) && name.bytes().all(is_plain) {
+        return Ok(());
+    }
+    let begin: String = name.chars().take(NAME_BYTES_MAX).collect();
+    Err(Status::invalid_argument(format!(
+        "{begin:?} is no name for an actor; use up to {NAME_BYTES_MAX} letters, digits, '-', '_' and '.'"
+    )))
+}
+
 #[tonic::async_trait]
 impl rollout_server::Rollout for RolloutService {
     type JoinStream = Pin<Box<dyn Stream<Item = Result<LearnerMessage, Status>> + Send>>;
@@ -24,6 +39,7 @@ impl rollout_server::Rollout for RolloutService {
         let Some(Message::Hello(hello)) = first else {
             return Err(Status::invalid_argument("an actor's first message is Hello"));
         };
+        check_name(&hello.name)?;
         let (to, from_learner) = mpsc::channel(ACTOR_QUEUE);
         let (answer, joined) = oneshot::channel();
         let over = |_| Status::unavailable("the run is over");
@@ -46,5 +62,23 @@ impl rollout_server::Rollout for RolloutService {
             let _ = events.send(Event::Gone(actor)).await;
         });
         Ok(Response::new(Box::pin(ReceiverStream::new(from_learner))))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_short_and_do_nothing_to_a_terminal() {
+        for good in ["actor-0", "a", "node_7.example.org", &"x".repeat(NAME_BYTES_MAX)] {
+            assert!(check_name(good).is_ok(), "{good}");
+        }
+        let long = "x".repeat(60_000);
+        for bad in ["", "two words", "line\nline", "\u{1b}[31mred", "\0", "naïve", "<b>", &long] {
+            let message = check_name(bad).unwrap_err().message().to_owned();
+            assert!(message.contains("is no name for an actor"), "{message}");
+            assert!(message.len() < 300 && !message.contains(char::is_control), "{message}");
+        }
     }
 }

@@ -14,6 +14,7 @@ use crate::{
     trainer::{TrainError, Trainer},
     web::{Web, WebError},
     weights::WeightsService,
+    write_queue::write_queue,
     writer::Writer,
 };
 use rit_algo::{ConfigError, Learner, Model};
@@ -152,7 +153,7 @@ pub async fn run(
         keep: config.checkpoints.keep,
         events: events.clone(),
     };
-    let (to_write, write_queue) = mpsc::channel();
+    let (to_write, write_queue) = write_queue(config.replay_episodes());
     let (trainer, board) = Trainer::new(config.clone(), run_dir.clone(), learner, loaded, news, to_write)?;
     let metrics = trainer.metrics_follower();
     let welcome = Welcome { actor: 0, run_id: run_dir.run_id().to_vec(), config: config.to_toml()? };

@@ -11,7 +11,10 @@ use rit_config::{Config, ConfigError, RunDir, RunDirError, set, set_live};
 use rit_env::{Scene, TaskError, rollout::LostEpisode};
 use rit_episode::{Episode, RunSeed};
 use rit_proto::v1;
-use std::sync::Arc;
+use std::sync::{
+    Arc,
+    atomic::{AtomicBool, Ordering},
+};
 use tokio::{
     sync::{Mutex, Semaphore, mpsc, oneshot, watch},
     task::JoinError,
@@ -19,6 +22,9 @@ use tokio::{
 
 /// Most episodes of each task that one evaluation rolls.
 pub const EPISODES_MAX: u32 = 1_000_000;
+
+/// Evaluations and episodes to watch that are under way or wait for their turn, at most.
+const WAITING_MAX: usize = 8;
 
 /// Changes what this process logs, or says why it cannot.
 pub type SetLog = Arc<dyn Fn(&str) -> Result<(), String> + Send + Sync>;
@@ -53,6 +59,9 @@ pub enum AskError {
     /// The checkpoint was not written.
     #[error("{0}")]
     Checkpoint(String),
+    /// Others wait for their turn.
+    #[error("{WAITING_MAX} evaluations are under way or wait for their turn; try again later")]
+    Busy,
     /// The episodes were not rolled to their end.
     #[error("the evaluation failed: {0}")]
     Rollout(#[from] JoinError),
@@ -83,6 +92,17 @@ pub struct RunHandle {
     measures: &'static [Measure],
     /// One caller's episodes at a time: training goes on beside them.
     rollouts: Arc<Semaphore>,
+    /// Room for those who wait for their turn.
+    waiting: Arc<Semaphore>,
+}
+
+/// Whoever asked: gone when this is dropped.
+struct Asking(Arc<AtomicBool>);
+
+impl Drop for Asking {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
 }
 
 impl RunHandle {
@@ -108,6 +128,7 @@ impl RunHandle {
             model,
             measures,
             rollouts: Arc::new(Semaphore::new(1)),
+            waiting: Arc::new(Semaphore::new(WAITING_MAX)),
         }
     }
 
@@ -163,7 +184,7 @@ impl RunHandle {
     pub async fn checkpoint(&self) -> Result<v1::CheckpointResponse, AskError> {
         let Checkpointed { progress, weights_digest, written } = self.ask(Control::Checkpoint).await?;
         let written = written.await.map_err(|_| AskError::Over)?;
-        let path = written.map_err(|error| AskError::Checkpoint(error.to_string()))?;
+        let path = written.map_err(AskError::Checkpoint)?;
         let (path, env_steps) = (path.display().to_string(), progress.env_steps);
         Ok(v1::CheckpointResponse { path, env_steps, weights_digest })
     }
@@ -183,15 +204,16 @@ impl RunHandle {
             _ => return Err(AskError::Episodes(episodes)),
         };
         let seed = seed.map_or_else(|| evaluation_seed(&config), RunSeed);
-        self.roll(move |acting, snapshot| {
-            let results = evaluator.evaluate_own(acting, &tasks, episodes, seed)?;
-            Ok(v1::Evaluation {
+        let evaluation = self.roll(move |acting, snapshot, given_up| {
+            let results = evaluator.evaluate_unless(acting, &tasks, episodes, seed, given_up)?;
+            Ok::<_, AskError>(results.map(|results| v1::Evaluation {
                 env_steps: snapshot.env_steps,
                 weights_version: snapshot.version,
                 tasks: results.iter().map(TaskResult::to_message).collect(),
-            })
-        })
-        .await?
+            }))
+        });
+        // What was given up has nobody to answer to.
+        evaluation.await??.ok_or(AskError::Over)
     }
 
     /// The episode of this number of the run's own evaluation of a task, rolled with the newest weights.
@@ -203,7 +225,7 @@ impl RunHandle {
         let evaluator = Evaluator::new(&config);
         let task = config.environment.task_set.task(task)?;
         let seed = evaluation_seed(&config);
-        self.roll(move |acting, snapshot| {
+        self.roll(move |acting, snapshot, _| {
             let (mut scenes, one) = (Vec::new(), number..number + 1);
             let mut episodes =
                 evaluator.watch(acting, task, one, seed, |_, world| scenes.extend(world.scene()))?;
@@ -213,17 +235,22 @@ impl RunHandle {
         .await?
     }
 
-    /// Rolls with the newest weights on a thread of its own. Whoever asked may go: the next one's turn comes
-    /// when the episodes are done all the same.
+    /// Rolls with the newest weights on a thread of its own. When whoever asked has gone, `work` is told by its last
+    /// argument to give up.
     async fn roll<T: Send + 'static>(
         &self,
-        work: impl FnOnce(&mut Acting, &Arc<Snapshot>) -> T + Send + 'static,
+        work: impl FnOnce(&mut Acting, &Arc<Snapshot>, &dyn Fn() -> bool) -> T + Send + 'static,
     ) -> Result<T, AskError> {
+        let room = Arc::clone(&self.waiting).try_acquire_owned().map_err(|_| AskError::Busy)?;
         let turn = Arc::clone(&self.rollouts).acquire_owned().await.map_err(|_| AskError::Over)?;
         let (snapshot, model) = (self.board.newest(), Arc::clone(&self.model));
+        let gone = Arc::new(AtomicBool::new(false));
+        // Dropped with this future, which is when the caller's connection or deadline ends.
+        let _asking = Asking(Arc::clone(&gone));
         let rolled = tokio::task::spawn_blocking(move || {
-            let _turn = turn;
-            work(&mut Acting::new(&model, &snapshot.to_params()), &snapshot)
+            let _places = (turn, room);
+            let given_up = || gone.load(Ordering::Relaxed);
+            work(&mut Acting::new(&model, &snapshot.to_params()), &snapshot, &given_up)
         });
         Ok(rolled.await?)
     }

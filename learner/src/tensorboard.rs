@@ -3,11 +3,13 @@
 //! A file is a row of TFRecords: length (u64), its masked CRC-32C, data, the data's masked CRC-32C, all
 //! little-endian; the data is a protobuf `Event`. Each learner writes a file of its own. One that goes on from a
 //! checkpoint first cuts away what was written behind it, so that there is one point a step. Each file begins with a
-//! session's start: a TensorBoard that is running then forgets what it had seen from that step on.
+//! session's start: a TensorBoard that is running then forgets what it had seen from that step on; before it stands
+//! whose the file is. Files that end in part of a record are cut behind the last whole one.
 
 use crate::{append_file::AppendFile, evaluation::TaskResult, metrics::Line};
 use crc::{CRC_32_ISCSI, Crc};
 use prost::Message;
+use rit_config::RunDir;
 use serde::{Deserialize, Serialize};
 use std::{
     collections::BTreeMap,
@@ -20,6 +22,12 @@ use std::{
 
 /// What TensorBoard knows event files by; seconds since 1970 follow, so that names sort by time.
 const PREFIX: &str = "events.out.tfevents.";
+
+/// Raise it when a tag's meaning changes.
+const FORMAT_VERSION: u32 = 1;
+
+/// No event file is longer.
+const FILE_BYTES_MAX: u64 = 1 << 32;
 
 const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISCSI);
 
@@ -42,37 +50,48 @@ pub struct EventFile {
 impl EventFile {
     /// Begins a file in this folder, behind what lay there at `position`. Files and records behind that were
     /// written by a learner that died, and will be written again: the first line to come has `from_env_steps` or
-    /// more.
+    /// more. Returns what somebody should know of too: files that had to be cut.
     ///
     /// # Errors
     /// When the folder or a file cannot be written.
-    pub fn create(folder: &Path, position: &Position, from_env_steps: u64) -> io::Result<Self> {
+    pub fn create(
+        folder: &Path,
+        run_dir: &RunDir,
+        position: &Position,
+        from_env_steps: u64,
+    ) -> io::Result<(Self, Vec<String>)> {
         DirBuilder::new().recursive(true).mode(0o700).create(folder)?;
-        let mut newest = 0;
+        let (mut newest, mut warnings, mut seen) = (0, Vec::new(), false);
         for entry in fs::read_dir(folder)? {
             let name = entry?.file_name();
-            let Some(number) = name.to_str().and_then(|name| name.strip_prefix(PREFIX)?.parse::<u64>().ok())
+            let Some((name, number)) =
+                name.to_str().and_then(|name| Some((name, name.strip_prefix(PREFIX)?.parse::<u64>().ok()?)))
             else {
                 continue;
             };
-            let path = folder.join(&name);
-            if name.to_str() > Some(position.file.as_str()) {
+            let path = folder.join(name);
+            if name > position.file.as_str() {
                 fs::remove_file(path)?;
-            } else if name.to_str() == Some(position.file.as_str()) {
-                let file = OpenOptions::new().write(true).open(path)?;
-                file.set_len(position.len.min(file.metadata()?.len()))?;
+            } else {
+                let is_last = name == position.file;
+                seen |= is_last;
+                warnings.extend(cut(&path, is_last.then_some(position.len))?);
             }
             newest = newest.max(number);
+        }
+        if !seen && !position.file.is_empty() {
+            warnings.push(format!("{} is gone", folder.join(&position.file).display()));
         }
         let name = format!("{PREFIX}{:010}", (wall_time() as u64).max(newest.saturating_add(1)));
         let path = folder.join(&name);
         let file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&path)?;
         let mut events = Self { file: AppendFile::new(path, file, 0)?, name };
         events.append(0, What::FileVersion("brain.Event:2".into()));
+        events.append(0, What::SourceMetadata(SourceMetadata { writer: writer(run_dir) }));
         let start = SessionLog { status: SessionStatus::Start.into() };
         events.append(from_env_steps, What::SessionLog(start));
         events.file.flush()?;
-        Ok(events)
+        Ok((events, warnings))
     }
 
     /// How far the files go.
@@ -97,6 +116,44 @@ impl EventFile {
         let event = Event { wall_time: wall_time(), step: env_steps as i64, what: Some(what) };
         self.file.append(&record(&event.encode_to_vec()));
     }
+}
+
+/// Whose a file is.
+fn writer(run_dir: &RunDir) -> String {
+    let run_id: String = run_dir.run_id().iter().map(|byte| format!("{byte:02x}")).collect();
+    format!("rit {}, format {FORMAT_VERSION}, run {run_id}", env!("CARGO_PKG_VERSION"))
+}
+
+/// Cuts a file behind its last whole record, or where a checkpoint says that it ends; what is said if records are
+/// missing there.
+fn cut(path: &Path, end: Option<u64>) -> io::Result<Option<String>> {
+    let bytes = rit_config::read_regular(path, FILE_BYTES_MAX)?;
+    let wanted = end.unwrap_or(bytes.len() as u64);
+    let whole = whole_records(&bytes[..bytes.len().min(wanted as usize)]);
+    if whole < bytes.len() {
+        OpenOptions::new().write(true).open(path)?.set_len(whole as u64)?;
+    }
+    let warning = || {
+        let path = path.display();
+        format!(
+            "{path} ends in part of a record or too early: it is cut behind its last whole one; metrics.jsonl has the same numbers"
+        )
+    };
+    Ok(((whole as u64) < wanted).then(warning))
+}
+
+/// Bytes of whole records at the beginning.
+fn whole_records(bytes: &[u8]) -> usize {
+    let mut rest = bytes;
+    let next = |rest: &mut &[u8]| -> Option<()> {
+        let (len, after) = rest.split_first_chunk::<8>()?;
+        let (len_crc, after) = after.split_first_chunk::<4>()?;
+        let (data, after) = after.split_at_checked(usize::try_from(u64::from_le_bytes(*len)).ok()?)?;
+        let (data_crc, after) = after.split_first_chunk::<4>()?;
+        (*len_crc == masked_crc(len) && *data_crc == masked_crc(data)).then(|| *rest = after)
+    };
+    while next(&mut rest).is_some() {}
+    bytes.len() - rest.len()
 }
 
 /// Seconds since 1970.
@@ -152,7 +209,7 @@ struct Event {
     wall_time: f64,
     #[prost(int64, tag = "2")]
     step: i64,
-    #[prost(oneof = "What", tags = "3, 5, 7")]
+    #[prost(oneof = "What", tags = "3, 5, 7, 10")]
     what: Option<What>,
 }
 
@@ -164,6 +221,14 @@ enum What {
     Summary(Summary),
     #[prost(message, tag = "7")]
     SessionLog(SessionLog),
+    #[prost(message, tag = "10")]
+    SourceMetadata(SourceMetadata),
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct SourceMetadata {
+    #[prost(string, tag = "1")]
+    writer: String,
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -198,6 +263,7 @@ enum SessionStatus {
 mod tests {
     use super::*;
     use crate::{checkpoint::Progress, evaluation::Exploring, measured::Measured};
+    use std::path::PathBuf;
 
     /// The events of a file, both checksums of each verified.
     fn read(bytes: &[u8]) -> Vec<Event> {
@@ -220,6 +286,29 @@ mod tests {
         let mut files: Vec<_> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
         files.sort();
         files.iter().map(|file| read(&fs::read(file).unwrap())).collect()
+    }
+
+    /// A run directory, its folder of event files, and a file begun there.
+    struct Run {
+        _folder: tempfile::TempDir,
+        run_dir: RunDir,
+    }
+
+    impl Run {
+        fn new() -> Self {
+            let config = rit_config::resolve("environment.task_set = \"matrix-game\"", "test", &[]).unwrap();
+            let folder = tempfile::tempdir().unwrap();
+            let run_dir = RunDir::create(&folder.path().join("run"), &config).unwrap();
+            Self { _folder: folder, run_dir }
+        }
+
+        fn folder(&self) -> PathBuf {
+            self.run_dir.tensorboard()
+        }
+
+        fn create(&self, position: &Position, from: u64) -> (EventFile, Vec<String>) {
+            EventFile::create(&self.folder(), &self.run_dir, position, from).unwrap()
+        }
     }
 
     /// (step, tag, value) of every scalar.
@@ -260,9 +349,8 @@ mod tests {
 
     #[test]
     fn lines_become_scalars_over_environment_steps() {
-        let folder = tempfile::tempdir().unwrap();
-        let folder = folder.path().join("tensorboard");
-        let mut events = EventFile::create(&folder, &Position::default(), 0).unwrap();
+        let run = Run::new();
+        let (mut events, _) = run.create(&Position::default(), 0);
         events.write(&evaluation(0));
         let measured = [("td_loss", 0.5), ("grad_norm", 3.0), ("q_total_mean", 0.0), ("target_mean", -1.5)];
         let measured = Measured(measured.map(|(name, value)| (name.to_owned(), value)).to_vec());
@@ -272,7 +360,7 @@ mod tests {
         let tasks = BTreeMap::from([("3v3".to_owned(), result)]);
         let line = Line::Training { progress: progress(100), wall_s: 2.0, epsilon: 0.125, measured, tasks };
         events.write(&line);
-        let files = read_all(&folder);
+        let files = read_all(&run.folder());
         assert_eq!(files.len(), 1);
         assert_eq!(files[0][0].what, Some(What::FileVersion("brain.Event:2".into())));
         assert!(files[0].iter().all(|event| event.wall_time > 1.7e9));
@@ -296,25 +384,57 @@ mod tests {
 
     #[test]
     fn no_step_is_there_twice_after_resuming() {
-        let folder = tempfile::tempdir().unwrap();
-        let mut first = EventFile::create(folder.path(), &Position::default(), 0).unwrap();
+        let run = Run::new();
+        let (mut first, _) = run.create(&Position::default(), 0);
         first.write(&evaluation(10));
         let at_checkpoint = first.position().clone();
         first.write(&evaluation(20));
         // A learner that goes on from there, and dies before its first checkpoint.
-        let mut second = EventFile::create(folder.path(), &at_checkpoint, 11).unwrap();
+        let (mut second, _) = run.create(&at_checkpoint, 11);
         second.write(&evaluation(20));
-        let mut third = EventFile::create(folder.path(), &at_checkpoint, 11).unwrap();
+        let (mut third, warnings) = run.create(&at_checkpoint, 11);
+        assert!(warnings.is_empty(), "{warnings:?}");
         third.write(&evaluation(20));
         assert!(third.position().file > second.position().file, "a name that was never used");
-        let files = read_all(folder.path());
+        let files = read_all(&run.folder());
         let steps: Vec<Vec<i64>> =
             files.iter().map(|events| events.iter().map(|event| event.step).collect()).collect();
-        assert_eq!(steps, [vec![0, 0, 10], vec![0, 11, 20]]);
+        assert_eq!(steps, [vec![0, 0, 0, 10], vec![0, 0, 11, 20]]);
         let start = SessionLog { status: SessionStatus::Start.into() };
-        assert_eq!(files[1][1].what, Some(What::SessionLog(start)));
+        assert_eq!(files[1][2].what, Some(What::SessionLog(start)));
+        let Some(What::SourceMetadata(source)) = &files[1][1].what else { panic!("{:?}", files[1][1]) };
+        assert_eq!(source.writer, writer(&run.run_dir));
         // One that begins anew keeps nothing.
-        EventFile::create(folder.path(), &Position::default(), 0).unwrap();
-        assert_eq!(read_all(folder.path()).len(), 1);
+        run.create(&Position::default(), 0);
+        assert_eq!(read_all(&run.folder()).len(), 1);
+    }
+
+    #[test]
+    fn what_is_torn_is_cut_behind_the_last_whole_record_and_said() {
+        let run = Run::new();
+        let (mut first, _) = run.create(&Position::default(), 0);
+        let path = run.folder().join(&first.position().file);
+        first.write(&evaluation(10));
+        let one = first.position().len;
+        first.write(&evaluation(20));
+        let whole = first.position();
+        let good = fs::read(&path).unwrap();
+        let mut altered = good.clone();
+        altered[one as usize + 14] ^= 1;
+        for (bytes, kept, said) in [
+            (&good[..], whole.len, 0),
+            (&[&good[..], b"torn by a dead learner"].concat()[..], whole.len, 0),
+            (&good[..good.len() - 1], one, 1),
+            (&altered[..], one, 1),
+            (&[], 0, 1),
+        ] {
+            fs::write(&path, bytes).unwrap();
+            let (second, warnings) = run.create(&whole, 21);
+            assert_eq!((fs::metadata(&path).unwrap().len(), warnings.len()), (kept, said), "{warnings:?}");
+            fs::remove_file(run.folder().join(&second.position().file)).unwrap();
+        }
+        fs::remove_file(&path).unwrap();
+        let (_, warnings) = run.create(&whole, 21);
+        assert!(warnings[0].ends_with("is gone"), "{warnings:?}");
     }
 }

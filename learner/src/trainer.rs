@@ -7,13 +7,15 @@ use crate::{
     ledger::Terms,
     measured::Measured,
     metrics::{Follower, Line, MetricsFile, Recent},
+    metrics_repair::{End, Header, MetricsError},
     replay::Replay,
     replay_log::remedy,
     summary::{Ended, Summary},
     tensorboard::{EventFile, Position},
     weights::{Snapshot, WeightsBoard},
     weights_file,
-    writer::{ToWrite, Written},
+    write_queue::WriteQueue,
+    writer::Written,
 };
 use rit_algo::{
     Acting, Learner, Regime,
@@ -88,6 +90,14 @@ pub enum News {
 /// Why training ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
+    /// The metrics that are there cannot be gone on with.
+    #[error("{path}: {error}")]
+    Metrics {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        error: MetricsError,
+    },
     /// The configuration cannot be written down.
     #[error(transparent)]
     Config(#[from] rit_config::ConfigError),
@@ -146,7 +156,7 @@ pub struct Trainer {
     /// Environment steps before the last batch.
     env_steps_before: u64,
     news: Box<dyn FnMut(News) + Send>,
-    writer: mpsc::Sender<ToWrite>,
+    writer: WriteQueue,
     /// What somebody should know of how the run begins.
     warnings: Vec<String>,
     /// What checkpoints say of where they come from.
@@ -180,14 +190,16 @@ impl Trainer {
         learner: Box<dyn Learner>,
         loaded: Option<Loaded>,
         news: Box<dyn FnMut(News) + Send>,
-        writer: mpsc::Sender<ToWrite>,
+        writer: WriteQueue,
     ) -> Result<(Self, Arc<WeightsBoard>), TrainError> {
         let lag = config.algorithm.policy_lag;
         let first = Snapshot::new(0, 0, acting_params(&*learner));
         let first_terms = Terms { weights_version: 0, epsilon: config.epsilon(0) };
         let task_set = config.environment.task_set;
         let tasks = config.tasks(Split::Training).iter().map(ToString::to_string).collect();
-        let (metrics, tensorboard) = files(&run_dir, loaded.as_ref().map(|loaded| &loaded.state.manifest))?;
+        let mut warnings = loaded.as_ref().map(|loaded| loaded.warnings.clone()).unwrap_or_default();
+        let manifest = loaded.as_ref().map(|loaded| &loaded.state.manifest);
+        let (metrics, tensorboard) = files(&run_dir, manifest, &mut warnings)?;
         let mut trainer = Self {
             replay: (learner.regime() == Regime::Replay).then(|| Replay::new(config.algorithm.buffer_size)),
             board: Arc::new(WeightsBoard::new(first, lag)),
@@ -201,7 +213,7 @@ impl Trainer {
             env_steps_before: 0,
             news,
             writer,
-            warnings: loaded.as_ref().map(|loaded| loaded.warnings.clone()).unwrap_or_default(),
+            warnings,
             origin: Origin::of(&run_dir, &config)?,
             learner,
             run_dir,
@@ -336,8 +348,7 @@ impl Trainer {
             self.recent.push(&episode, progress.updates);
             let episode = Arc::new(episode);
             if let Some(replay) = &mut self.replay {
-                // Without a writer there is nobody to write; checkpoints say so.
-                let _ = self.writer.send(ToWrite::Episode(Arc::clone(&episode)));
+                self.writer.episode(Arc::clone(&episode));
                 replay.insert(Arc::clone(&episode));
             }
             collected.push(episode);
@@ -466,7 +477,7 @@ impl Trainer {
             snapshots: kept.iter().map(|snapshot| Snapshot::clone(snapshot)).collect(),
         };
         // A writer that has gone drops `done`, which tells whoever waits.
-        let _ = self.writer.send(ToWrite::Checkpoint(Box::new(state), done));
+        self.writer.checkpoint(Box::new(state), done);
         weights_digest
     }
 
@@ -483,7 +494,7 @@ impl Trainer {
                 written
             });
             let written = written.blocking_recv().map_err(|_| "the writer has gone".to_owned())?;
-            written.map(drop).map_err(|error| error.to_string())
+            written.map(drop)
         });
         if let Err(error) = checkpointed {
             return Err(TrainError::Checkpoint(self.rescue(error)));
@@ -574,17 +585,26 @@ fn acting_params(learner: &dyn Learner) -> &[f32] {
     &learner.params()[learner.model().acting()]
 }
 
-/// The files that show how training goes: begun, or continued from a checkpoint.
-fn files(run_dir: &RunDir, manifest: Option<&Manifest>) -> Result<(MetricsFile, EventFile), TrainError> {
-    let (len, wall_s) = manifest.map_or((0, 0.0), |manifest| (manifest.metrics_len, manifest.wall_s));
-    let path = run_dir.metrics();
-    let metrics = MetricsFile::open(&path, len, wall_s).map_err(|error| TrainError::Io { path, error })?;
+/// The files that show how training goes: begun, or continued from a checkpoint. What was repaired is said.
+fn files(
+    run_dir: &RunDir,
+    manifest: Option<&Manifest>,
+    warnings: &mut Vec<String>,
+) -> Result<(MetricsFile, EventFile), TrainError> {
+    let wall_s = manifest.map_or(0.0, |manifest| manifest.wall_s);
+    let end = manifest
+        .map(|Manifest { progress, metrics_len: len, .. }| End { env_steps: progress.env_steps, len: *len });
+    let (path, header) = (run_dir.metrics(), Header::of(run_dir));
+    let metrics = MetricsFile::open(&path, &header, end, wall_s);
+    let (metrics, warning) = metrics.map_err(|error| TrainError::Metrics { path, error })?;
+    warnings.extend(warning);
     let (position, from) = manifest.map_or((Position::default(), 0), |manifest| {
         (manifest.tensorboard.clone(), manifest.progress.env_steps + 1)
     });
     let path = run_dir.tensorboard();
-    let tensorboard =
-        EventFile::create(&path, &position, from).map_err(|error| TrainError::Io { path, error })?;
+    let tensorboard = EventFile::create(&path, run_dir, &position, from);
+    let (tensorboard, repaired) = tensorboard.map_err(|error| TrainError::Io { path, error })?;
+    warnings.extend(repaired);
     Ok((metrics, tensorboard))
 }
 

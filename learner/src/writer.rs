@@ -1,13 +1,14 @@
-//! The writing thread: replay as it grows, checkpoints when they are due. Training does not wait for the disk.
+//! The writing thread: replay as it grows, checkpoints when they are due.
 //!
 //! The trainer hands over each episode that entered replay (shared, not copied) and, when a checkpoint is due, a
-//! copy of its state. A disk that refuses costs nothing but the checkpoint: episodes stay queued, at most as many
-//! as replay holds, and the next checkpoint tries again.
+//! copy of its state (see [`crate::write_queue`]). A disk that refuses costs nothing but the checkpoint: episodes stay
+//! queued, at most as many as replay holds, and the next checkpoint tries again.
 
 use crate::{
     checkpoint::{self, CheckpointError, TrainingState},
     coordinator::Event,
     replay_log::ReplayLog,
+    write_queue::{StateToWrite, ToWrite, WriteQueueReader},
 };
 use rit_algo::Model;
 use rit_config::RunDir;
@@ -15,13 +16,13 @@ use rit_episode::Episode;
 use std::{
     collections::VecDeque,
     path::PathBuf,
-    sync::{Arc, mpsc},
+    sync::Arc,
     time::{Duration, Instant},
 };
-use tokio::sync::{mpsc as async_mpsc, oneshot};
+use tokio::sync::mpsc as async_mpsc;
 
-/// Where a checkpoint lies, relative to the run directory; or why it was not written.
-pub type Written = Result<PathBuf, CheckpointError>;
+/// Where a checkpoint lies, relative to the run directory; or why it was not written, in words.
+pub type Written = Result<PathBuf, String>;
 
 /// What became of a checkpoint.
 #[derive(Clone, Debug)]
@@ -32,15 +33,6 @@ pub struct CheckpointEnded {
     pub duration: Duration,
     /// Why it is not on disk, if it is not.
     pub failed: Option<String>,
-}
-
-/// What the writer is given, in order.
-#[derive(Debug)]
-pub enum ToWrite {
-    /// The next episode of replay.
-    Episode(Arc<Episode>),
-    /// A checkpoint, and who wants to know of it.
-    Checkpoint(Box<TrainingState>, Option<oneshot::Sender<Written>>),
 }
 
 /// The writer.
@@ -62,16 +54,16 @@ pub struct Writer {
 
 impl Writer {
     /// Writes until nobody gives it anything any more.
-    pub fn run(mut self, queue: &mpsc::Receiver<ToWrite>) {
+    pub fn run(mut self, queue: &WriteQueueReader) {
         let mut waiting: VecDeque<Arc<Episode>> = VecDeque::new();
-        while let Ok(next) = queue.recv() {
+        while let Some(next) = queue.next() {
             match next {
                 ToWrite::Episode(episode) => {
                     waiting.push_back(episode);
                     // A failure is told by the checkpoint that needs what is missing.
                     let _ = self.append(&mut waiting);
                 }
-                ToWrite::Checkpoint(state, answer) => {
+                ToWrite::Checkpoint(StateToWrite { state, answers }) => {
                     let begun = Instant::now();
                     let written = self.checkpoint(&mut waiting, &state);
                     let (env_steps, duration) = (state.manifest.progress.env_steps, begun.elapsed());
@@ -82,13 +74,14 @@ impl Writer {
                         }
                         Err(error) => tracing::error!(%error, env_steps, "a checkpoint was not written"),
                     }
-                    let failed = written.as_ref().err().map(ToString::to_string);
+                    let written = written.map_err(|error| error.to_string());
+                    let failed = written.as_ref().err().cloned();
                     let ended = CheckpointEnded { env_steps, duration, failed };
                     // At the end of a run nobody counts any more.
                     let _ = self.events.blocking_send(Event::CheckpointEnded(ended));
-                    if let Some(answer) = answer {
+                    for answer in answers {
                         // Whoever asked may have gone.
-                        let _ = answer.send(written);
+                        let _ = answer.send(written.clone());
                     }
                 }
             }
@@ -106,7 +99,11 @@ impl Writer {
         Ok(())
     }
 
-    fn checkpoint(&mut self, waiting: &mut VecDeque<Arc<Episode>>, state: &TrainingState) -> Written {
+    fn checkpoint(
+        &mut self,
+        waiting: &mut VecDeque<Arc<Episode>>,
+        state: &TrainingState,
+    ) -> Result<PathBuf, CheckpointError> {
         self.append(waiting)?;
         self.log.sync()?;
         let path = checkpoint::save(&self.run_dir, &self.model, state, self.keep)?;

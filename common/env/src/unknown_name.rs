@@ -2,13 +2,16 @@
 
 use std::fmt;
 
+/// Characters of a name that are repeated: whoever asks may be anybody.
+const NAME_CHARS: usize = 64;
+
 /// A name that means nothing, with those that do.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("unknown {what} {name:?}; known: {}", known.join(", "))]
 pub struct UnknownName {
     /// What was asked for.
     pub what: &'static str,
-    /// The name given.
+    /// The name given, or how it begins.
     pub name: String,
     /// Names that would do.
     pub known: Vec<String>,
@@ -24,7 +27,7 @@ impl UnknownName {
         let found = known.iter().find(|one| one.to_string() == name);
         found.copied().ok_or_else(|| Self {
             what,
-            name: name.to_owned(),
+            name: name.chars().take(NAME_CHARS).collect(),
             known: known.iter().map(T::to_string).collect(),
         })
     }

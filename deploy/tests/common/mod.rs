@@ -253,3 +253,12 @@ pub fn shared_memory_of(run_dir: &Path) -> Vec<PathBuf> {
 pub fn json_lines(path: &Path) -> Vec<Value> {
     fs::read_to_string(path).unwrap().lines().map(|line| serde_json::from_str(line).unwrap()).collect()
 }
+
+/// The lines of a run's metrics behind the first, which says whose they are.
+pub fn metrics_lines(run_dir: &Path) -> Vec<Value> {
+    let mut lines = json_lines(&run_dir.join("metrics.jsonl"));
+    let run_id = fs::read_to_string(run_dir.join("run_id")).unwrap();
+    let header = serde_json::json!({ "kind": "run", "format_version": 1, "run_id": run_id.trim() });
+    assert_eq!(lines.remove(0), header);
+    lines
+}

@@ -76,7 +76,7 @@ impl IntoResponse for ApiError {
             Self::NotFound => StatusCode::NOT_FOUND,
             Self::TooSlow => StatusCode::GATEWAY_TIMEOUT,
             Self::Body(rejection) => rejection.status(),
-            Self::Ask(AskError::Over) => StatusCode::SERVICE_UNAVAILABLE,
+            Self::Ask(AskError::Over | AskError::Busy) => StatusCode::SERVICE_UNAVAILABLE,
             Self::Ask(
                 AskError::Task(_)
                 | AskError::Tasks(_)

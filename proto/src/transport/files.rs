@@ -1,5 +1,6 @@
 //! Files with secrets and certificates. A secret that others can read is none.
 
+use rustix::fs::{Mode, OFlags};
 use std::{
     fs::{File, Metadata},
     io::{self, Read as _},
@@ -36,6 +37,9 @@ pub enum FileError {
         "{0} holds no token of at least {TOKEN_LENGTH_MIN} letters and digits; `openssl rand -hex 32` makes one"
     )]
     NoToken(PathBuf),
+    /// A pipe, a device or a folder.
+    #[error("{0} is no regular file")]
+    NotRegular(PathBuf),
     /// Not what it should be.
     #[error("{path} holds no {what} in PEM form")]
     NotPem {
@@ -72,9 +76,14 @@ pub fn check_private(path: &Path, metadata: &Metadata) -> Result<(), FileError> 
 
 fn read(path: &Path, check: impl FnOnce(&Metadata) -> Result<(), FileError>) -> Result<Vec<u8>, FileError> {
     let io = |error| FileError::Io { path: path.to_owned(), error };
-    // What is looked at is what is read: the open file, not its name.
-    let file = File::open(path).map_err(io)?;
-    check(&file.metadata().map_err(io)?)?;
+    // What is looked at is what is read: the open file, not its name. A pipe that nobody writes to opens at once.
+    let file = rustix::fs::open(path, OFlags::RDONLY | OFlags::NONBLOCK | OFlags::CLOEXEC, Mode::empty());
+    let file = File::from(file.map_err(|error| io(error.into()))?);
+    let metadata = file.metadata().map_err(io)?;
+    if !metadata.is_file() {
+        return Err(FileError::NotRegular(path.to_owned()));
+    }
+    check(&metadata)?;
     let mut bytes = Vec::new();
     file.take(FILE_BYTES_MAX).read_to_end(&mut bytes).map_err(io)?;
     Ok(bytes)

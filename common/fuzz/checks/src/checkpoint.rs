@@ -17,6 +17,7 @@ use rit_learner::{
     trainer::{TrainError, Trainer, Work},
     weights::Snapshot,
     weights_file,
+    write_queue::write_queue,
 };
 use sha2::{Digest as _, Sha256};
 use std::{
@@ -126,7 +127,7 @@ impl Run {
         let Ok(learner) = learner(&self.model, &self.config) else { panic!("no threads") };
         let loaded = checkpoint::load_newest(&self.run_dir, &*learner, &self.expected, &self.config);
         let Ok(loaded) = loaded else { return false };
-        let (to_write, _) = mpsc::channel();
+        let (to_write, _) = write_queue(0);
         let run_dir = self.run_dir.clone();
         let trainer = Trainer::new(self.config.clone(), run_dir, learner, loaded, Box::new(|_| ()), to_write);
         let Ok((trainer, board)) = trainer else { panic!("the trainer does not start") };

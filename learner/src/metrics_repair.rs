@@ -1,0 +1,317 @@
+//! What a learner finds of `metrics.jsonl` when it goes on: lines that are whole are kept, and what is not is said.
+
+use rit_config::RunDir;
+use serde::{Deserialize, Serialize};
+use std::{
+    fs::{self, File, OpenOptions},
+    io::{self, BufRead as _, BufReader, Seek as _, SeekFrom, Write as _},
+    ops::Range,
+    path::{Path, PathBuf},
+};
+
+/// What the lines of this build look like. Raise it when a key's meaning changes.
+pub const METRICS_FORMAT: u32 = 1;
+
+/// The first line of the file: whose it is. The kind comes first, so that whoever reads lines can tell.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Header {
+    kind: String,
+    format_version: u32,
+    run_id: String,
+}
+
+/// How the first line begins.
+const HEADER: &[u8] = br#"{"kind":"run","#;
+
+/// Whether a line says whose file it is.
+pub(crate) fn is_header(line: &[u8]) -> bool {
+    line.starts_with(HEADER)
+}
+
+impl Header {
+    /// Of this run's file.
+    pub fn of(run_dir: &RunDir) -> Self {
+        let run_id = run_dir.run_id().iter().map(|byte| format!("{byte:02x}")).collect();
+        Self { kind: "run".into(), format_version: METRICS_FORMAT, run_id }
+    }
+
+    /// For tests that have no run directory.
+    #[cfg(test)]
+    pub(crate) fn of_test() -> Self {
+        Self { kind: "run".into(), format_version: METRICS_FORMAT, run_id: "ab".into() }
+    }
+
+    /// The line itself.
+    pub(crate) fn line(&self) -> io::Result<Vec<u8>> {
+        let mut line = serde_json::to_vec(self)?;
+        line.push(b'\n');
+        Ok(line)
+    }
+
+    fn check(&self, line: &[u8]) -> Result<(), MetricsError> {
+        let found: Self = serde_json::from_slice(line).map_err(|error| MetricsError::Io(error.into()))?;
+        match found {
+            Self { format_version, .. } if format_version != self.format_version => {
+                Err(MetricsError::Format { found: format_version })
+            }
+            Self { run_id, .. } if run_id != self.run_id => Err(MetricsError::OtherRun { found: run_id }),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Why a learner cannot go on with the file.
+#[derive(Debug, thiserror::Error)]
+pub enum MetricsError {
+    /// Another run's.
+    #[error(
+        "it is of another run ({found}); move it away, and the lines up to the checkpoint are missed, nothing else"
+    )]
+    OtherRun {
+        /// That run.
+        found: String,
+    },
+    /// Another build's.
+    #[error(
+        "it has format version {found}, this build writes {METRICS_FORMAT}; go on with the build that wrote it"
+    )]
+    Format {
+        /// Its version.
+        found: u32,
+    },
+    /// The system refused.
+    #[error(transparent)]
+    Io(#[from] io::Error),
+}
+
+/// Where a checkpoint says that the file ends.
+#[derive(Clone, Copy, Debug)]
+pub struct End {
+    /// The last line's environment steps, at most.
+    pub env_steps: u64,
+    /// Its length in bytes.
+    pub len: u64,
+}
+
+/// What a line must have.
+#[derive(Deserialize)]
+struct Any {
+    env_steps: u64,
+}
+
+/// What lies in the file up to an end.
+#[derive(Debug, Default)]
+struct Lines {
+    /// Where whole lines lie.
+    whole: Vec<Range<u64>>,
+    /// Lines among them that cannot be read.
+    broken: usize,
+    /// Environment steps of the last whole one.
+    last: u64,
+}
+
+impl Lines {
+    fn len(&self) -> u64 {
+        self.whole.iter().map(|range| range.end - range.start).sum()
+    }
+
+    /// Reads lines until one is beyond the end: that, and what follows it, was written by a learner that died.
+    fn read(path: &Path, header: &Header, until_env_steps: u64) -> Result<Self, MetricsError> {
+        let mut reader = BufReader::new(File::open(path)?);
+        let (mut lines, mut line, mut at) = (Self::default(), Vec::new(), 0);
+        // Broken lines behind the last whole one are no hole among them.
+        let mut broken_since = 0;
+        loop {
+            line.clear();
+            let read = reader.read_until(b'\n', &mut line)? as u64;
+            if read == 0 {
+                return Ok(lines);
+            }
+            let range = at..at + read;
+            at = range.end;
+            if range.start == 0 && is_header(&line) && line.ends_with(b"\n") {
+                header.check(&line)?;
+                lines.whole.push(range);
+                continue;
+            }
+            match serde_json::from_slice::<Any>(&line) {
+                Ok(any) if any.env_steps > until_env_steps => return Ok(lines),
+                Ok(any) if line.ends_with(b"\n") => {
+                    (lines.broken, lines.last) = (lines.broken + broken_since, any.env_steps);
+                    broken_since = 0;
+                    match lines.whole.last_mut() {
+                        Some(last) if last.end == range.start => last.end = range.end,
+                        _ => lines.whole.push(range),
+                    }
+                }
+                _ => broken_since += 1,
+            }
+        }
+    }
+
+    /// Whether nothing lies before or between them.
+    fn are_the_beginning(&self) -> bool {
+        self.whole.len() <= 1 && self.whole.first().is_none_or(|range| range.start == 0)
+    }
+}
+
+/// Cuts the file behind its last whole line up to the end, and takes lines out that cannot be read. Returns how long
+/// it is then, and what somebody should know of it.
+///
+/// # Errors
+/// When it is of another run or build, or the system refuses.
+pub fn repair(path: &Path, header: &Header, end: End) -> Result<(u64, Option<String>), MetricsError> {
+    if !path.exists() {
+        return Ok((
+            0,
+            Some(format!("{} is gone: a new one begins at {} steps", path.display(), end.env_steps)),
+        ));
+    }
+    if !fs::metadata(path)?.is_file() {
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is no regular file").into());
+    }
+    let mut lines = Lines::read(path, header, end.env_steps)?;
+    // The header and the first line behind it are one range.
+    lines.whole.dedup_by(|next, last| {
+        let joined = last.end == next.start;
+        if joined {
+            last.end = next.end;
+        }
+        joined
+    });
+    let (len, last) = (lines.len(), lines.last);
+    let path_shown = path.display();
+    if !lines.are_the_beginning() {
+        let damaged = rewrite(path, &lines.whole)?;
+        let (broken, damaged) = (lines.broken, damaged.display());
+        let warning = format!(
+            "{path_shown}: {broken} of its lines cannot be read and are left out; as it was, it lies in {damaged}"
+        );
+        return Ok((len, Some(warning)));
+    }
+    let file = OpenOptions::new().write(true).open(path)?;
+    file.set_len(len)?;
+    let warning = (len != end.len).then(|| {
+        format!(
+            "{path_shown} ends at {last} steps where the checkpoint at {} steps remembers more: lines are missing, it \
+             goes on behind its last whole one",
+            end.env_steps
+        )
+    });
+    Ok((len, warning))
+}
+
+/// Writes the file anew, of these ranges; keeps the old one beside it. Returns where.
+fn rewrite(path: &Path, ranges: &[Range<u64>]) -> io::Result<PathBuf> {
+    let numbers = std::iter::once(String::new()).chain((2..100).map(|number| format!("-{number}")));
+    let mut places = numbers.map(|number| path.with_extension(format!("jsonl.damaged{number}")));
+    let damaged = places.find(|place| fs::symlink_metadata(place).is_err());
+    let damaged = damaged.ok_or_else(|| io::Error::other("there are 99 damaged ones beside it already"))?;
+    let partial = path.with_extension("jsonl.partial");
+    let (mut from, mut to) = (File::open(path)?, File::create(&partial)?);
+    for range in ranges {
+        from.seek(SeekFrom::Start(range.start))?;
+        io::copy(&mut io::Read::take(&mut from, range.end - range.start), &mut to)?;
+    }
+    to.flush()?;
+    to.sync_all()?;
+    fs::hard_link(path, &damaged)?;
+    fs::rename(&partial, path)?;
+    Ok(damaged)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const RUN: &str = r#"{"kind":"run","format_version":1,"run_id":"ab"}"#;
+
+    fn line(env_steps: u64) -> String {
+        format!("{{\"kind\":\"evaluation\",\"env_steps\":{env_steps},\"td_loss\":null}}\n")
+    }
+
+    /// Header and lines at 0, 10 and 20 steps, whose checkpoint was written behind the last; then one at 30.
+    fn whole() -> String {
+        format!("{RUN}\n{}{}{}{}", line(0), line(10), line(20), line(30))
+    }
+
+    fn end() -> End {
+        End { env_steps: 20, len: (whole().len() - line(30).len()) as u64 }
+    }
+
+    /// What is left of a file, and what is said.
+    fn repaired(text: &str) -> (String, Option<String>) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("metrics.jsonl");
+        fs::write(&path, text).unwrap();
+        let (len, warning) = repair(&path, &Header::of_test(), end()).unwrap();
+        let left = fs::read_to_string(&path).unwrap();
+        assert_eq!(left.len() as u64, len);
+        if let Some(damaged) = warning.as_ref().filter(|warning| warning.contains("damaged")) {
+            assert_eq!(
+                fs::read_to_string(folder.path().join("metrics.jsonl.damaged")).unwrap(),
+                text,
+                "{damaged}"
+            );
+        }
+        (left, warning)
+    }
+
+    #[test]
+    fn what_a_dead_learner_wrote_last_goes_without_a_word() {
+        let kept = &whole()[..end().len as usize];
+        assert_eq!(repaired(&whole()), (kept.to_owned(), None));
+        assert_eq!(
+            repaired(&whole()[..whole().len() - 5]),
+            (kept.to_owned(), None),
+            "torn behind the checkpoint"
+        );
+        assert_eq!(repaired(kept), (kept.to_owned(), None));
+    }
+
+    #[test]
+    fn what_is_missing_is_said_and_the_last_whole_line_is_the_end() {
+        let (all, kept) = (whole(), whole()[..end().len as usize].to_owned());
+        let two = &all[..all.find(&line(20)).unwrap()];
+        for torn in [two.to_owned(), kept[..kept.len() - 1].to_owned(), format!("{two}{{\"kind")] {
+            let (left, warning) = repaired(&torn);
+            assert_eq!(left, two);
+            assert!(
+                warning.unwrap().contains("ends at 10 steps where the checkpoint at 20 steps remembers more")
+            );
+        }
+        let (left, warning) = repaired("");
+        assert!(left.is_empty() && warning.unwrap().contains("ends at 0 steps"));
+        let gone = tempfile::tempdir().unwrap();
+        let (len, warning) = repair(&gone.path().join("metrics.jsonl"), &Header::of_test(), end()).unwrap();
+        assert!(len == 0 && warning.unwrap().ends_with("is gone: a new one begins at 20 steps"));
+    }
+
+    #[test]
+    fn a_torn_line_in_the_middle_is_taken_out_and_the_rest_stays() {
+        // Torn by a full disk, and glued to the next.
+        let glued = whole().replace(&line(10), &line(10)[..20]);
+        let (left, warning) = repaired(&glued);
+        assert_eq!(left, format!("{RUN}\n{}", line(0)), "the glued one is both");
+        assert!(warning.unwrap().contains("lines are missing"), "nothing whole lies behind it");
+        let zeros = whole().replace(&line(10), "\0\0\0\n");
+        let (left, warning) = repaired(&zeros);
+        assert_eq!(left, format!("{RUN}\n{}{}", line(0), line(20)));
+        assert!(warning.unwrap().contains("1 of its lines cannot be read and are left out"));
+    }
+
+    #[test]
+    fn another_runs_file_is_refused_and_stays_as_it_is() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("metrics.jsonl");
+        for (text, message) in [
+            (whole().replace("\"ab\"", "\"cd\""), "it is of another run (cd); move it away"),
+            (whole().replace("\"format_version\":1", "\"format_version\":9"), "it has format version 9"),
+        ] {
+            fs::write(&path, &text).unwrap();
+            let error = repair(&path, &Header::of_test(), end()).unwrap_err().to_string();
+            assert!(error.contains(message), "{error}");
+            assert_eq!(fs::read_to_string(&path).unwrap(), text);
+        }
+    }
+}
