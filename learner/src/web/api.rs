@@ -17,7 +17,7 @@ use axum::{
 use rit_algo::Regime;
 use rit_env::{BodyKind, LinkKind, Scene, SceneLink, Split, Task};
 use rit_episode::Action;
-use rit_proto::v1;
+use rit_proto::{transport::AllTaken, v1};
 use serde::{Deserialize, Serialize};
 use std::{
     fs::{self, File},
@@ -56,6 +56,8 @@ pub enum ApiError {
     Unauthorized,
     #[error("{0}")]
     Forbidden(&'static str),
+    #[error(transparent)]
+    AllTaken(AllTaken),
     #[error("there is nothing here")]
     NotFound,
     #[error("the answer takes too long")]
@@ -73,6 +75,7 @@ impl IntoResponse for ApiError {
         let status = match &self {
             Self::Unauthorized => StatusCode::UNAUTHORIZED,
             Self::Forbidden(_) => StatusCode::FORBIDDEN,
+            Self::AllTaken(_) => StatusCode::SERVICE_UNAVAILABLE,
             Self::NotFound => StatusCode::NOT_FOUND,
             Self::TooSlow => StatusCode::GATEWAY_TIMEOUT,
             Self::Body(rejection) => rejection.status(),

@@ -9,7 +9,7 @@ use axum::{
     response::{Html, IntoResponse as _, Redirect, Response},
 };
 use rit_config::RunDir;
-use rit_proto::transport::is_secret;
+use rit_proto::transport::{Place, is_secret};
 use serde::Deserialize;
 use sha2::{Digest as _, Sha256};
 use std::{net::IpAddr, sync::Arc};
@@ -85,6 +85,11 @@ pub async fn only_to_loopback(request: Request, next: Next) -> Response {
 pub async fn only_with_token(State(gate): State<Arc<Gate>>, request: Request, next: Next) -> Response {
     if !gate.lets_in(request.headers()) {
         return ApiError::Unauthorized.into_response();
+    }
+    if let Some(place) = request.extensions().get::<Place>()
+        && let Err(all_taken) = place.make_known()
+    {
+        return ApiError::AllTaken(all_taken).into_response();
     }
     if *request.method() != Method::GET && *request.method() != Method::HEAD && !is_own(request.headers()) {
         return ApiError::Forbidden("the Origin of a request that changes something must be this server")

@@ -11,7 +11,7 @@ mod events;
 use crate::{metrics::Follower, run_handle::RunHandle};
 use auth::Gate;
 use axum::{
-    Router,
+    Extension, Router,
     extract::{DefaultBodyLimit, Request},
     http::{HeaderName, HeaderValue, header},
     middleware::{self, Next},
@@ -24,6 +24,7 @@ use hyper_util::{
     service::TowerToHyperService,
 };
 use rit_config::{RunDir, WebListen};
+use rit_proto::transport::{Guarded, PlaceLimits, Places, STRANGER_DEADLINE};
 use std::{
     fs::{self, OpenOptions},
     io::{self, ErrorKind, Write as _},
@@ -33,10 +34,11 @@ use std::{
     sync::Arc,
     time::{Duration, SystemTime, UNIX_EPOCH},
 };
-use tokio::{net::TcpListener, sync::Semaphore, task::JoinSet};
+use tokio::{net::TcpListener, task::JoinSet};
 
-/// Connections at a time, and so requests at a time; further ones wait.
-const CONNECTIONS_MAX: usize = 32;
+/// Connections at a time, and so requests at a time: of browsers that have shown the token, and of those that have not
+/// yet, or only ask whether the learner lives.
+const PLACES: PlaceLimits = PlaceLimits { known: 32, strangers: 32, deadline: STRANGER_DEADLINE };
 
 /// How long the head of a request may take, and a connection lie idle.
 const HEAD_TIMEOUT: Duration = Duration::from_secs(10);
@@ -149,9 +151,8 @@ impl Web {
     }
 
     async fn accept(&self, router: &Router, connections: &mut JoinSet<()>) {
-        let free = Arc::new(Semaphore::new(CONNECTIONS_MAX));
-        // The semaphore is never closed.
-        while let Ok(place) = Arc::clone(&free).acquire_owned().await {
+        let places = Places::new(PLACES);
+        loop {
             while connections.try_join_next().is_some() {}
             let stream = match self.listener.accept().await {
                 Ok((stream, _)) => stream,
@@ -161,14 +162,16 @@ impl Web {
                     continue;
                 }
             };
-            let service = TowerToHyperService::new(router.clone());
+            let (place, leave) = places.stranger();
+            // Whoever shows the token makes its connection's place a known one.
+            let service = TowerToHyperService::new(router.clone().layer(Extension(place.clone())));
+            let stream = Guarded::new(stream, place, leave);
             connections.spawn(async move {
                 let mut server = http1::Builder::new();
                 server.timer(TokioTimer::new()).header_read_timeout(HEAD_TIMEOUT);
                 if let Err(error) = server.serve_connection(TokioIo::new(stream), service).await {
                     tracing::debug!(%error, "a connection to the web page broke");
                 }
-                drop(place);
             });
         }
     }

@@ -1,7 +1,7 @@
 //! What callers must show before a learner listens to them.
 
 use super::{
-    ALPN_HTTP2, Address,
+    ALPN_HTTP2, Address, Place,
     files::{FileError, read_authorities, read_certificates, read_key, read_token},
 };
 use std::{fmt, path::PathBuf, sync::Arc};
@@ -119,6 +119,11 @@ impl Access {
         Ok(Self { token, tls: Some(TlsAcceptor::from(Arc::new(config))) })
     }
 
+    /// Whether a certificate is all that callers must show.
+    pub(super) fn by_certificate(&self) -> bool {
+        self.token.is_none()
+    }
+
     /// Lets only calls through that carry the token, if there is one.
     pub(super) fn guard(&self) -> Guard {
         Guard(self.token.as_ref().map(|token| format!("Bearer {token}").into()))
@@ -130,7 +135,7 @@ pub fn is_secret(given: &[u8], secret: &[u8]) -> bool {
     given.iter().zip(secret).fold(given.len() ^ secret.len(), |all, (a, b)| all | usize::from(a ^ b)) == 0
 }
 
-/// Lets only calls through that carry the token.
+/// Lets only calls through that carry the token; who makes one is known from then on.
 #[derive(Clone)]
 pub(super) struct Guard(Option<Arc<str>>);
 
@@ -138,10 +143,12 @@ impl Interceptor for Guard {
     fn call(&mut self, request: Request<()>) -> Result<Request<()>, Status> {
         let Some(known) = &self.0 else { return Ok(request) };
         let given = request.metadata().get("authorization").map_or(&[][..], |value| value.as_bytes());
-        if is_secret(given, known.as_bytes()) {
-            Ok(request)
-        } else {
-            Err(Status::unauthenticated("the call does not carry this learner's token"))
+        if !is_secret(given, known.as_bytes()) {
+            return Err(Status::unauthenticated("the call does not carry this learner's token"));
         }
+        if let Some(place) = request.extensions().get::<Place>() {
+            place.make_known().map_err(|all_taken| Status::resource_exhausted(all_taken.to_string()))?;
+        }
+        Ok(request)
     }
 }

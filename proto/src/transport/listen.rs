@@ -1,6 +1,9 @@
 //! Listening sockets, and which connections are let in.
 
-use super::{Address, CONNECT_TIMEOUT};
+use super::{
+    Access, Address, CONNECT_TIMEOUT,
+    places::{AllTaken, Guarded, Place, Places},
+};
 use std::{
     collections::BTreeSet,
     convert::Infallible,
@@ -10,14 +13,13 @@ use std::{
     os::unix::fs::{FileTypeExt as _, PermissionsExt as _},
     path::{Path, PathBuf},
     pin::Pin,
-    sync::Arc,
     task::{Context, Poll},
     time::{Duration, Instant},
 };
 use tokio::{
     io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, ReadBuf},
     net::{TcpListener, TcpStream, UnixListener, UnixStream},
-    sync::{OwnedSemaphorePermit, Semaphore, mpsc},
+    sync::mpsc,
     task::JoinSet,
 };
 use tokio_rustls::{TlsAcceptor, server::TlsStream};
@@ -84,8 +86,8 @@ pub enum Refused {
     #[error("the system does not say whose it is: {0}")]
     UnknownUser(io::Error),
     /// All places are taken.
-    #[error("{0} connections are open, which is the most there may be")]
-    TooMany(usize),
+    #[error(transparent)]
+    TooMany(#[from] AllTaken),
     /// No TLS, or a certificate that does not do.
     #[error("{ip}: {error}")]
     Tls {
@@ -94,9 +96,6 @@ pub enum Refused {
         /// What was wrong.
         error: io::Error,
     },
-    /// The TLS handshake took too long.
-    #[error("{0} did not finish its TLS handshake in {CONNECT_TIMEOUT:?}")]
-    Slow(IpAddr),
 }
 
 /// A listening socket.
@@ -162,29 +161,38 @@ impl Incoming {
         &self.address
     }
 
-    /// Passes on the connections that are let in, at most so many at a time. Each refusal is logged once, however
-    /// often the same caller comes.
+    /// Passes on the connections that are let in. Each is a stranger's until it has shown what `access` demands. Each
+    /// refusal is logged once, however often the same caller comes.
     pub(super) async fn accept(
         &self,
-        tls: Option<&TlsAcceptor>,
-        connections_max: usize,
+        access: &Access,
+        places: &Places,
         connections: &mpsc::Sender<io::Result<Connection>>,
     ) -> Infallible {
-        let places = Arc::new(Semaphore::new(connections_max));
         let mut handshakes = JoinSet::new();
         let mut logged = BTreeSet::new();
         loop {
             let let_in = tokio::select! {
                 accepted = self.next() => match accepted {
-                    Ok((io, ip)) => match (io, Arc::clone(&places).try_acquire_owned(), tls) {
-                        (Err(refused), ..) => Err(refused),
-                        (_, Err(_), _) => Err(Refused::TooMany(connections_max)),
-                        (Ok(Io::Tcp(stream)), Ok(place), Some(tls)) => {
-                            handshakes.spawn(handshake(stream, ip, tls.clone(), place));
-                            continue;
+                    Ok((Err(refused), _)) => Err(refused),
+                    Ok((Ok(stream), ip)) => {
+                        let (place, leave) = places.stranger();
+                        match (stream, &access.tls) {
+                            (Stream::Tcp(stream), Some(tls)) => {
+                                let stream = Guarded::new(stream, place, leave);
+                                handshakes.spawn(handshake(stream, ip, tls.clone(), access.by_certificate()));
+                                continue;
+                            }
+                            (Stream::Tcp(stream), None) => {
+                                let io = Io::Tcp(Guarded::new(stream, place.clone(), leave));
+                                Ok(Connection { io, place })
+                            }
+                            (Stream::Unix(stream), _) => {
+                                let io = Io::Unix(Guarded::new(stream, place.clone(), leave));
+                                Ok(Connection { io, place })
+                            }
                         }
-                        (Ok(io), Ok(place), _) => Ok(Connection { io, _place: place }),
-                    },
+                    }
                     Err(error) => {
                         if logged.insert(error.to_string()) {
                             tracing::error!(%error, address = %self.address, "cannot accept connections");
@@ -214,17 +222,17 @@ impl Incoming {
     }
 
     /// The next caller: whether it may be heard, and, over TCP, from where it calls.
-    async fn next(&self) -> io::Result<(Result<Io, Refused>, IpAddr)> {
+    async fn next(&self) -> io::Result<(Result<Stream, Refused>, IpAddr)> {
         let here = IpAddr::from([127, 0, 0, 1]);
         Ok(match &self.socket {
             Socket::Unix(listener) => {
                 let (stream, _) = listener.accept().await?;
-                (check_user(&stream).map(|()| Io::Unix(stream)), here)
+                (check_user(&stream).map(|()| Stream::Unix(stream)), here)
             }
             Socket::Tcp(listener) => {
                 let (stream, from) = listener.accept().await?;
                 stream.set_nodelay(true)?;
-                (Ok(Io::Tcp(stream)), from.ip().to_canonical())
+                (Ok(Stream::Tcp(stream)), from.ip().to_canonical())
             }
         })
     }
@@ -261,15 +269,21 @@ fn check_user(stream: &UnixStream) -> Result<(), Refused> {
     }
 }
 
+/// Greets a caller. Where its certificate is all that it has to show, it is known then.
 async fn handshake(
-    stream: TcpStream,
+    stream: Guarded<TcpStream>,
     ip: IpAddr,
     tls: TlsAcceptor,
-    place: OwnedSemaphorePermit,
+    by_certificate: bool,
 ) -> Result<Connection, Refused> {
-    let greeted = tokio::time::timeout(CONNECT_TIMEOUT, tls.accept(stream).into_fallible()).await;
-    match greeted.map_err(|_| Refused::Slow(ip))? {
-        Ok(stream) => Ok(Connection { io: Io::Tls(Box::new(stream)), _place: place }),
+    let place = stream.place().clone();
+    match tls.accept(stream).into_fallible().await {
+        Ok(stream) => {
+            if by_certificate {
+                place.make_known()?;
+            }
+            Ok(Connection { io: Io::Tls(Box::new(stream)), place })
+        }
         Err((error, mut stream)) => {
             // Closed with unread bytes, the connection would be reset, and the caller would not learn why: what it
             // still sends is read until it closes.
@@ -282,16 +296,22 @@ async fn handshake(
     }
 }
 
-/// A connection that was let in; it has one of the places until it is dropped.
+/// Who called, before it is greeted.
+enum Stream {
+    Unix(UnixStream),
+    Tcp(TcpStream),
+}
+
+/// A connection that was accepted; it has one of the places until it is dropped.
 pub(super) struct Connection {
     io: Io,
-    _place: OwnedSemaphorePermit,
+    place: Place,
 }
 
 enum Io {
-    Unix(UnixStream),
-    Tcp(TcpStream),
-    Tls(Box<TlsStream<TcpStream>>),
+    Unix(Guarded<UnixStream>),
+    Tcp(Guarded<TcpStream>),
+    Tls(Box<TlsStream<Guarded<TcpStream>>>),
 }
 
 /// What both directions need: the stream inside, pinned.
@@ -310,9 +330,11 @@ impl Connection {
 }
 
 impl Connected for Connection {
-    type ConnectInfo = ();
+    type ConnectInfo = Place;
 
-    fn connect_info(&self) {}
+    fn connect_info(&self) -> Place {
+        self.place.clone()
+    }
 }
 
 impl AsyncRead for Connection {

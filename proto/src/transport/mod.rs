@@ -15,6 +15,7 @@ mod address;
 mod connect;
 mod files;
 mod listen;
+mod places;
 mod serve;
 #[cfg(test)]
 mod tests;
@@ -25,6 +26,7 @@ pub use address::{Address, AddressError};
 pub use connect::{Client, ConnectError, CredentialFiles, Credentials, CredentialsError, connect};
 pub use files::{FileError, check_private};
 pub use listen::{Incoming, ListenError};
+pub use places::{AllTaken, Guarded, Leave, Place, PlaceLimits, Places};
 pub use serve::{CONNECTIONS_MAX, REQUEST_BYTES_MAX, ServeLimits, serve};
 pub use words::status_words;
 
@@ -35,6 +37,9 @@ const ALPN_HTTP2: &[u8] = b"h2";
 
 /// How long connecting, and greeting whoever connects, may take.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// How long whoever connects may take to show that it may speak.
+pub const STRANGER_DEADLINE: Duration = Duration::from_secs(10);
 
 /// How long most calls may take: their answers are at hand.
 const CALL_TIMEOUT: Duration = Duration::from_secs(10);

@@ -1,6 +1,9 @@
 //! Serving, within limits.
 
-use super::{Access, Incoming, KEEPALIVE_EVERY, KEEPALIVE_TIMEOUT, LONG_CALL_TIMEOUT};
+use super::{
+    Access, Incoming, KEEPALIVE_EVERY, KEEPALIVE_TIMEOUT, LONG_CALL_TIMEOUT, PlaceLimits, Places,
+    STRANGER_DEADLINE,
+};
 use tokio::sync::{mpsc, oneshot};
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{
@@ -11,6 +14,9 @@ use tower::limit::GlobalConcurrencyLimitLayer;
 
 /// Connections one address holds open at most: far more than a run has actors.
 pub const CONNECTIONS_MAX: usize = 512;
+
+/// Connections beside them of callers that have not shown yet that they may speak.
+const STRANGERS_MAX: usize = 64;
 
 /// Largest request a service takes that does not say otherwise: all of them are small.
 pub const REQUEST_BYTES_MAX: usize = 64 << 10;
@@ -27,15 +33,17 @@ const HEADER_BYTES_MAX: u32 = 16 << 10;
 /// How much of everything a server takes on.
 #[derive(Clone, Copy, Debug)]
 pub struct ServeLimits {
-    /// Connections that may be open at a time.
-    pub connections: usize,
+    /// Connections that may be open at a time, and strangers' beside them.
+    pub connections: PlaceLimits,
     /// Calls of all connections that may wait for their answers at a time.
     pub calls: usize,
 }
 
 impl Default for ServeLimits {
     fn default() -> Self {
-        Self { connections: CONNECTIONS_MAX, calls: CALLS_MAX }
+        let connections =
+            PlaceLimits { known: CONNECTIONS_MAX, strangers: STRANGERS_MAX, deadline: STRANGER_DEADLINE };
+        Self { connections, calls: CALLS_MAX }
     }
 }
 
@@ -51,11 +59,12 @@ pub async fn serve(
     closed: impl Future<Output = ()>,
 ) -> Result<(), tonic::transport::Error> {
     let guard = InterceptorLayer::new(access.guard());
+    let places = Places::new(limits.connections);
     let (connections, accepted) = mpsc::channel(1);
     let (stop, stopped) = oneshot::channel::<()>();
     let accepting = async move {
         tokio::select! {
-            never = incoming.accept(access.tls.as_ref(), limits.connections, &connections) => match never {},
+            never = incoming.accept(&access, &places, &connections) => match never {},
             () = closed => {}
         }
         // Nobody is accepted any more; the socket goes now, not when the last connection has ended.

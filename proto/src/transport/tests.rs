@@ -14,7 +14,10 @@ use std::{
     sync::Arc,
 };
 use tempfile::TempDir;
-use tokio::sync::{Semaphore, oneshot};
+use tokio::{
+    io::AsyncReadExt as _,
+    sync::{Semaphore, oneshot},
+};
 use tonic::{Code, Request, Response, Status, service::Routes};
 
 const TOKEN: &str = "0123456789abcdef";
@@ -367,15 +370,21 @@ async fn another_user_is_not_heard() {
     connect(&server.address, &Credentials::token(TOKEN)).await.unwrap();
 }
 
+/// Limits with so many places.
+fn places(known: usize, strangers: usize) -> ServeLimits {
+    let connections = PlaceLimits { known, strangers, ..ServeLimits::default().connections };
+    ServeLimits { connections, ..ServeLimits::default() }
+}
+
 #[tokio::test]
 async fn no_more_connections_than_there_are_places() {
-    let limits = ServeLimits { connections: 2, ..ServeLimits::default() };
-    let server = listen(&loopback(), Access::token(TOKEN), limits).await;
+    let server = listen(&loopback(), Access::token(TOKEN), places(2, 8)).await;
     let credentials = Credentials::token(TOKEN);
     let first = connect(&server.address, &credentials).await.unwrap();
     let second = connect(&server.address, &credentials).await.unwrap();
-    let third = connect(&server.address, &credentials).await;
-    assert!(matches!(third, Err(ConnectError::NoAnswer { .. })), "{third:?}");
+    let third = connect(&server.address, &credentials).await.unwrap_err();
+    assert!(matches!(third, ConnectError::Busy { .. }), "{third:?}");
+    assert!(third.to_string().contains("2 connections are open, which is the most there may be"), "{third}");
     drop(first);
     let in_time = tokio::time::timeout(Duration::from_secs(60), async {
         while connect(&server.address, &credentials).await.is_err() {
@@ -384,6 +393,52 @@ async fn no_more_connections_than_there_are_places() {
     });
     in_time.await.expect("a place is free again");
     drop(second);
+}
+
+#[tokio::test]
+async fn silent_connections_keep_nobody_out_and_are_closed() {
+    let pki = Pki::new();
+    let (ca, authority) = pki.authority("ca.pem");
+    let server = pki.identity("server", &authority, "127.0.0.1", false);
+    let client = pki.identity("client", &authority, "client", false);
+    let tls = Access::over_tcp(&loopback(), &files(&server, Some(&ca), None)).unwrap();
+    for (access, credentials) in
+        [(Access::token(TOKEN), Credentials::token(TOKEN)), (tls, credentials(&ca, Some(&client), None))]
+    {
+        let learner = listen(&loopback(), access, places(2, 4)).await;
+        let Address::Tcp { host, port } = &learner.address else { unreachable!() };
+        let before = connect(&learner.address, &credentials).await.unwrap();
+        let mut silent = Vec::new();
+        for _ in 0..600 {
+            silent.push(tokio::net::TcpStream::connect((host.as_str(), *port)).await.unwrap());
+        }
+        let after = connect(&learner.address, &credentials).await.unwrap();
+        // All but the newest few were closed for those behind them.
+        for stream in &mut silent[..590] {
+            let end = async { while stream.read(&mut [0; 64]).await.is_ok_and(|read| read > 0) {} };
+            tokio::time::timeout(Duration::from_secs(60), end).await.expect("it is closed");
+        }
+        for known in [before, after] {
+            let mut hurried = Request::new(v1::PauseRequest {});
+            hurried.set_timeout(Duration::from_secs(60));
+            let answer = ControlClient::new(known).pause(hurried).await.unwrap_err();
+            assert_eq!(answer.code(), Code::Unimplemented, "{answer}");
+        }
+    }
+}
+
+#[tokio::test]
+async fn whoever_does_not_show_the_token_in_time_is_closed() {
+    let mut limits = places(2, 4);
+    limits.connections.deadline = Duration::from_millis(50);
+    let learner = listen(&loopback(), Access::token(TOKEN), limits).await;
+    let known = connect(&learner.address, &Credentials::token(TOKEN)).await.unwrap();
+    let Address::Tcp { host, port } = &learner.address else { unreachable!() };
+    let mut silent = tokio::net::TcpStream::connect((host.as_str(), *port)).await.unwrap();
+    let end = async { while silent.read(&mut [0; 64]).await.is_ok_and(|read| read > 0) {} };
+    tokio::time::timeout(Duration::from_secs(60), end).await.expect("it is closed");
+    let answer = ControlClient::new(known).pause(v1::PauseRequest {}).await.unwrap_err();
+    assert_eq!(answer.code(), Code::Unimplemented, "whoever is known stays: {answer}");
 }
 
 #[tokio::test]
