@@ -9,7 +9,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let descriptors = protox::compile(files, ["."])?;
     tonic_prost_build::configure()
         // Weights and frames are passed on without a copy.
-        .bytes(".rit.v1.Snapshot.params")
+        .bytes(".rit.v1.SnapshotPiece.data")
         .bytes(".rit.v1.Frame.header")
         .bytes(".rit.v1.Frame.payload")
         // What callers get is printed as JSON too.

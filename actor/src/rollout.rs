@@ -2,7 +2,7 @@
 
 use crate::{
     sink::{EpisodeSink, SinkError},
-    weights::Weights,
+    weights::{Weights, WeightsError},
 };
 use rit_algo::{Acting, Model};
 use rit_config::Config;
@@ -14,10 +14,7 @@ use rit_episode::{
     Episode,
     wire::{self, EncodeError, Frame, PayloadLayout, RunId},
 };
-use rit_proto::{
-    transport::status_words,
-    v1::{Lease, Snapshot},
-};
+use rit_proto::v1::Lease;
 use std::sync::{
     Arc,
     atomic::{AtomicBool, Ordering},
@@ -53,18 +50,8 @@ impl Failures {
 #[derive(Debug, thiserror::Error)]
 pub enum RolloutError {
     /// The weights a lease asks for cannot be had.
-    #[error("no weights from the learner: {}", status_words(.0))]
-    Weights(#[from] tonic::Status),
-    /// Weights of another model.
-    #[error(
-        "the learner sent {found} acting parameters, this actor's model has {expected}; use one build and one configuration"
-    )]
-    OtherModel {
-        /// Parameters that came.
-        found: usize,
-        /// Parameters of the model.
-        expected: usize,
-    },
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
     /// Environments that fail again and again.
     #[error("{FAILURES_MAX} episodes in a row were lost, the last: {0}")]
     Environment(LostEpisode),
@@ -144,12 +131,9 @@ impl Roller {
     }
 
     fn params(&mut self, runtime: &Handle, version: u64) -> Result<Vec<f32>, RolloutError> {
-        let Snapshot { params, .. } = &*runtime.block_on(self.weights.get(version))?;
-        let (words, rest) = params.as_chunks::<4>();
-        let expected = self.model.acting().len();
-        if words.len() != expected || !rest.is_empty() {
-            return Err(RolloutError::OtherModel { found: words.len(), expected });
-        }
+        // As many as the model has: others are refused where they come in.
+        let snapshot = runtime.block_on(self.weights.get(version))?;
+        let (words, _) = snapshot.params.as_chunks::<4>();
         Ok(words.iter().map(|&word| f32::from_le_bytes(word)).collect())
     }
 }

@@ -129,7 +129,8 @@ impl ActorError {
             | Self::Address(_)
             | Self::SharedMemory(_)
             | Self::LearnerGone(_)
-            | Self::Rollout(RolloutError::Weights(_) | RolloutError::Send(_)) => true,
+            | Self::Rollout(RolloutError::Send(_)) => true,
+            Self::Rollout(RolloutError::Weights(error)) => error.may_pass(),
             Self::Refused(_)
             | Self::Replaced(_)
             | Self::Config(_)
@@ -254,8 +255,10 @@ impl Actor {
         let (leases, lease_queue) = mpsc::channel(1);
         let (done, lease_done) = mpsc::channel(1);
         let stop = Arc::new(AtomicBool::new(false));
+        let model = Arc::new(Model::new(config.model())?);
+        let acting_bytes = size_of::<f32>() * model.acting().len();
         let roller = Roller {
-            model: Arc::new(Model::new(config.model())?),
+            model,
             rollout: Roller::rollout(&config),
             sink: match &self.learner {
                 Learner::Here(run_dir) => {
@@ -274,9 +277,9 @@ impl Actor {
             run_id: run_id.try_into().map_err(|_| ActorError::RunId)?,
             actor,
             failures: Failures::default(),
-            weights: Weights::watch(client, config.algorithm.policy_lag)
+            weights: Weights::watch(client, config.algorithm.policy_lag, acting_bytes)
                 .await
-                .map_err(RolloutError::Weights)?,
+                .map_err(|status| RolloutError::Weights(status.into()))?,
             stop: Arc::clone(&stop),
         };
         let (result, mut rolled) = oneshot::channel();

@@ -26,7 +26,6 @@ use rit_episode::{
 };
 use rit_ipc::{CreateError, EpisodeReceiver, Limits, ReceiveError};
 use rit_proto::{
-    MESSAGE_BYTES_MAX,
     transport::{
         Access, AccessError, AccessFiles, Address, AddressError, Incoming, ListenError, REQUEST_BYTES_MAX,
         ServeLimits, serve,
@@ -201,9 +200,7 @@ pub async fn run(
     health_reporter.set_serving::<EpisodesServer<EpisodesService>>().await;
     health_reporter.set_serving::<ControlServer<ControlService>>().await;
     let routes = Routes::new(health)
-        .add_service(
-            weights.max_decoding_message_size(REQUEST_BYTES_MAX).max_encoding_message_size(MESSAGE_BYTES_MAX),
-        )
+        .add_service(weights.max_decoding_message_size(REQUEST_BYTES_MAX))
         .add_service(rollout.max_decoding_message_size(REQUEST_BYTES_MAX))
         .add_service(EpisodesServer::new(episodes).max_decoding_message_size(episode_bytes_max))
         .add_service(ControlServer::new(control).max_decoding_message_size(REQUEST_BYTES_MAX));

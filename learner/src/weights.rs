@@ -1,14 +1,18 @@
 //! Snapshots of the acting weights: the newest for whoever watches, and the few that leases still ask for.
 
 use bytes::Bytes;
-use rit_proto::v1::{self, weights_server};
+use rit_proto::{
+    snapshot::pieces,
+    v1::{self, weights_server},
+};
 use std::{
     collections::VecDeque,
     pin::Pin,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
+    task::{Context, Poll, ready},
 };
 use tokio::sync::watch;
-use tokio_stream::{Stream, StreamExt as _, wrappers::WatchStream};
+use tokio_stream::{Stream, wrappers::WatchStream};
 use tonic::{Request, Response, Status};
 
 /// The acting weights after so many updates.
@@ -34,8 +38,8 @@ impl Snapshot {
         words.iter().map(|&word| f32::from_le_bytes(word)).collect()
     }
 
-    fn to_message(&self) -> v1::Snapshot {
-        v1::Snapshot { version: self.version, params: self.params.clone() }
+    fn pieces(&self) -> Pieces {
+        Box::new(pieces(self.version, self.params.clone()))
     }
 }
 
@@ -92,27 +96,56 @@ impl WeightsBoard {
 #[derive(Clone, Debug)]
 pub struct WeightsService(pub Arc<WeightsBoard>);
 
+/// What is left to send of a snapshot.
+type Pieces = Box<dyn Iterator<Item = v1::SnapshotPiece> + Send>;
+
+/// Each newest snapshot, piece by piece. One that is begun is sent to its end.
+struct NewestInPieces {
+    snapshots: WatchStream<Arc<Snapshot>>,
+    rest: Pieces,
+}
+
+impl Stream for NewestInPieces {
+    type Item = Result<v1::SnapshotPiece, Status>;
+
+    fn poll_next(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Self::Item>> {
+        loop {
+            if let Some(piece) = self.rest.next() {
+                return Poll::Ready(Some(Ok(piece)));
+            }
+            match ready!(Pin::new(&mut self.snapshots).poll_next(cx)) {
+                Some(snapshot) => self.rest = snapshot.pieces(),
+                None => return Poll::Ready(None),
+            }
+        }
+    }
+}
+
 #[tonic::async_trait]
 impl weights_server::Weights for WeightsService {
-    type WatchStream = Pin<Box<dyn Stream<Item = Result<v1::Snapshot, Status>> + Send>>;
+    type WatchStream = Pin<Box<dyn Stream<Item = Result<v1::SnapshotPiece, Status>> + Send>>;
+    type GetStream = Self::WatchStream;
 
     async fn watch(&self, _: Request<v1::WatchRequest>) -> Result<Response<Self::WatchStream>, Status> {
         let snapshots = WatchStream::new(self.0.newest.subscribe());
-        Ok(Response::new(Box::pin(snapshots.map(|snapshot| Ok(snapshot.to_message())))))
+        Ok(Response::new(Box::pin(NewestInPieces { snapshots, rest: Box::new(std::iter::empty()) })))
     }
 
-    async fn get(&self, request: Request<v1::GetRequest>) -> Result<Response<v1::Snapshot>, Status> {
+    async fn get(&self, request: Request<v1::GetRequest>) -> Result<Response<Self::GetStream>, Status> {
         let version = request.into_inner().version;
         let newest = self.0.newest().version;
         let snapshot = self.0.get(version);
         let gone = || Status::not_found(format!("weights {version} are not kept; the newest are {newest}"));
-        snapshot.map(|snapshot| Response::new(snapshot.to_message())).ok_or_else(gone)
+        let snapshot = snapshot.ok_or_else(gone)?;
+        Ok(Response::new(Box::pin(tokio_stream::iter(snapshot.pieces().map(Ok)))))
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use rit_proto::snapshot::{Assembly, PIECE_BYTES};
+    use tokio_stream::StreamExt as _;
     use weights_server::Weights as _;
 
     fn snapshot(version: u64) -> Snapshot {
@@ -130,7 +163,7 @@ mod tests {
             board.publish(snapshot(version));
         }
         let next = late.next().await.unwrap().unwrap();
-        assert_eq!((next.version, next.params), (5, snapshot(5).params));
+        assert_eq!((next.version, next.data), (5, snapshot(5).params));
         assert_eq!(board.newest().to_params(), [5.0, -0.5]);
     }
 
@@ -142,8 +175,26 @@ mod tests {
         }
         let service = WeightsService(board);
         let get = async |version| service.get(Request::new(v1::GetRequest { version })).await;
-        assert_eq!(get(4).await.unwrap().into_inner().version, 4);
-        assert_eq!(get(5).await.unwrap().into_inner().version, 5);
-        assert_eq!(get(3).await.unwrap_err().code(), tonic::Code::NotFound);
+        for version in [4, 5] {
+            let pieces = get(version).await.unwrap().into_inner().collect::<Vec<_>>().await;
+            assert_eq!((pieces.len(), pieces[0].as_ref().unwrap().version), (1, version));
+        }
+        assert_eq!(get(3).await.err().unwrap().code(), tonic::Code::NotFound);
+    }
+
+    #[tokio::test]
+    async fn a_snapshot_that_is_begun_is_sent_to_its_end_before_a_newer_one() {
+        let large = |version: u64| Snapshot::new(version, 0, &vec![version as f32; PIECE_BYTES / 2]);
+        let board = Arc::new(WeightsBoard::new(large(0), 1));
+        let service = WeightsService(Arc::clone(&board));
+        let mut stream = service.watch(Request::new(v1::WatchRequest {})).await.unwrap().into_inner();
+        let mut assembly = Assembly::new(2 * PIECE_BYTES);
+        for version in [0, 5] {
+            let first = stream.next().await.unwrap().unwrap();
+            assert_eq!(assembly.push(first), Ok(None));
+            (1..=5).for_each(|newer| board.publish(large(newer)));
+            let second = stream.next().await.unwrap().unwrap();
+            assert_eq!(assembly.push(second).unwrap().unwrap().params, large(version).params);
+        }
     }
 }

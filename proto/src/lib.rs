@@ -1,5 +1,6 @@
 //! The `rit.v1` gRPC packages (see the .proto files beside this crate) and the ways to reach them.
 
+pub mod snapshot;
 pub mod transport;
 
 /// Generated from `rit/v1/*.proto`, where every message is documented.
@@ -7,9 +8,6 @@ pub mod transport;
 pub mod v1 {
     tonic::include_proto!("rit.v1");
 }
-
-/// Largest message either side accepts: weights of a large model, with room.
-pub const MESSAGE_BYTES_MAX: usize = 256 << 20;
 
 /// A run's state as JSON has it: `"running"`, `"paused"`, `"stopping"`.
 fn state_name<S: serde::Serializer>(state: &i32, serializer: S) -> Result<S::Ok, S::Error> {
