@@ -6,7 +6,7 @@ use rit_config::{Config, RunDir};
 use rit_env::Script;
 use rit_episode::{Policy, RunSeed};
 use rit_learner::{
-    checkpoint::{LATEST, WEIGHTS},
+    checkpoint::{self, WEIGHTS},
     trainer::evaluation_seed,
     weights_file,
 };
@@ -46,15 +46,14 @@ impl Trained {
     /// When it has none, or it is not as it was written.
     pub fn load(run: &Path) -> Result<Self, Failure> {
         let (run_dir, config) = RunDir::open(run)?;
-        let path = run_dir.checkpoints().join(LATEST).join(WEIGHTS);
-        if !path.exists() {
+        let Some(folder) = checkpoint::latest(&run_dir, &config).map_err(Failure::input)? else {
             let root = run_dir.root().display();
             return Err(Failure::input_message(format!(
                 "{root} has no checkpoint yet; `rit ctl --run {root} checkpoint` writes one"
             )));
-        }
+        };
         let model = Arc::new(Model::new(config.model()).map_err(Failure::input)?);
-        let params = weights_file::load(&path, model.layout())?;
+        let params = weights_file::load(&folder.join(WEIGHTS), model.layout())?;
         Ok(Self { config, model, params })
     }
 }

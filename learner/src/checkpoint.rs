@@ -21,7 +21,7 @@ mod origin;
 mod written;
 
 pub use manifest::{Manifest, Progress, SnapshotMark};
-pub use newest::{Loaded, load_newest};
+pub use newest::{Loaded, latest, load_newest};
 pub use origin::{FORMAT_VERSION, Origin, OtherOrigin};
 
 use crate::{

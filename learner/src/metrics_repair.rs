@@ -31,7 +31,7 @@ pub(crate) fn is_header(line: &[u8]) -> bool {
 impl Header {
     /// Of this run's file.
     pub fn of(run_dir: &RunDir) -> Self {
-        let run_id = run_dir.run_id().iter().map(|byte| format!("{byte:02x}")).collect();
+        let run_id = run_dir.lineage().iter().map(|byte| format!("{byte:02x}")).collect();
         Self { kind: "run".into(), format_version: METRICS_FORMAT, run_id }
     }
 

@@ -120,7 +120,7 @@ impl EventFile {
 
 /// Whose a file is.
 fn writer(run_dir: &RunDir) -> String {
-    let run_id: String = run_dir.run_id().iter().map(|byte| format!("{byte:02x}")).collect();
+    let run_id: String = run_dir.lineage().iter().map(|byte| format!("{byte:02x}")).collect();
     format!("rit {}, format {FORMAT_VERSION}, run {run_id}", env!("CARGO_PKG_VERSION"))
 }
 

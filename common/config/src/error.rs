@@ -19,6 +19,21 @@ pub enum ConfigError {
         /// What the parser said, in one line.
         reason: String,
     },
+    /// A run's file of another build.
+    #[error("config.toml has format_version {found}, this build reads 1; go on with the build that wrote it")]
+    Format {
+        /// Its version.
+        found: String,
+    },
+    /// A run's file that does not say all that weights follow from.
+    #[error(
+        "config.toml lacks {key}, from which weights follow: an older build wrote it; add the value that the run was \
+         trained with"
+    )]
+    Incomplete {
+        /// The key.
+        key: String,
+    },
     /// A setting that sets nothing.
     #[error("--set {0}: write --set section.key=value, such as --set algorithm.lr=0.0005")]
     NoAssignment(String),

@@ -16,6 +16,7 @@ mod resolve;
 mod run_dir;
 mod run_lock;
 mod run_place;
+mod saved;
 
 pub use config::{
     Actors, Algorithm, Checkpoints, Config, Environment, Evaluation, Learner, Network, OptimizerName,

@@ -1,7 +1,7 @@
 //! A run directory in the hands of the one process that writes to it: made, gone on with, and given back.
 
 use crate::{
-    Config, RunDir, RunDirError, method_keys, resolve,
+    Config, RunDir, RunDirError, method_keys,
     resolve::may_go_on,
     run_dir::{
         CONFIG, LINEAGE, RUN_ID, TOKEN, existing, hex, random_bytes, read_config, utf8, why_missing,
@@ -9,6 +9,7 @@ use crate::{
     },
     run_lock::{LOCK, RunLock},
     run_place::{self, Came, PLACE},
+    saved::{Saved, resolve_saved},
 };
 use std::{
     fs::{self, DirBuilder, OpenOptions, Permissions},
@@ -96,12 +97,12 @@ impl OwnedRunDir {
         let (run_dir, old) = RunDir::open(&root)?;
         let wrong = |error| RunDirError::Config { path: root.join(CONFIG), error };
         method_keys::same(old.algorithm.name, settings).map_err(wrong)?;
-        let new = resolve(&text, CONFIG, settings).map_err(wrong)?;
+        let Saved { config: new, notices } = resolve_saved(&text, settings).map_err(wrong)?;
         may_go_on(&old, &new).map_err(wrong)?;
-        let mut owned =
-            Self { run_dir, lock: Some(lock), before: Before::Run { config: text }, notices: Vec::new() };
+        let mut owned = Self { run_dir, lock: Some(lock), before: Before::Run { config: text }, notices };
         owned.begin()?;
-        if new != old {
+        // What an older build did not write is written from now on.
+        if new != old || !owned.notices.is_empty() {
             owned.run_dir.write_config(&new)?;
         }
         Ok((owned, new))

@@ -168,8 +168,13 @@ fn is_under(key: &str, keys: &[&str]) -> bool {
     keys.iter().any(|one| key == *one || key.starts_with(&format!("{one}.")))
 }
 
+/// Whether no weight follows from a key.
+pub(crate) fn is_free(key: &str) -> bool {
+    is_under(key, &FREE)
+}
+
 /// Every `section.key` of the method with its value.
-fn flat(config: &Config) -> Result<BTreeMap<String, Value>, ConfigError> {
+pub(crate) fn flat(config: &Config) -> Result<BTreeMap<String, Value>, ConfigError> {
     let table = config.to_table()?;
     let mut keys = BTreeMap::new();
     for (section, value) in table {

@@ -1,6 +1,9 @@
 //! The run directory: where everything of one run lies, and under which names.
 
-use crate::{Config, ConfigError, read_text, resolve};
+use crate::{
+    Config, ConfigError, read_text,
+    saved::{self, Saved, resolve_saved},
+};
 use rit_episode::wire::RunId;
 use std::{
     env, fs,
@@ -97,7 +100,7 @@ pub enum RunDirError {
 
 impl RunDir {
     pub(crate) fn to_toml(&self, config: &Config) -> Result<String, RunDirError> {
-        config.to_toml().map_err(|error| RunDirError::Config { path: self.config_path(), error })
+        saved::to_text(config).map_err(|error| RunDirError::Config { path: self.config_path(), error })
     }
 
     /// Opens a run's directory to look at it, and reads its configuration. To write to it, see
@@ -108,7 +111,7 @@ impl RunDir {
     pub fn open(root: &Path) -> Result<(Self, Config), RunDirError> {
         let root = existing(root)?;
         let text = read_config(&root)?;
-        let config = resolve(&text, CONFIG, &[])
+        let Saved { config, .. } = resolve_saved(&text, &[])
             .map_err(|error| RunDirError::Config { path: root.join(CONFIG), error })?;
         let digits = |name: &str| {
             let path = root.join(name);

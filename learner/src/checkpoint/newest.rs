@@ -1,7 +1,8 @@
 //! Which checkpoint training goes on from.
 
 use super::{
-    CheckpointError, Manifest, Origin, OtherOrigin, TrainingState, folders, load, load_manifest, written,
+    CheckpointError, LATEST, MANIFEST, Manifest, Origin, OtherOrigin, TrainingState, folders, load,
+    load_manifest, written,
 };
 use crate::replay_log;
 use rit_algo::Learner;
@@ -73,6 +74,27 @@ pub fn load_newest(
     match written::newest(run_dir) {
         Some(newest) => Err(CheckpointError::Gone { folder: all, newest }),
         None => Ok(None),
+    }
+}
+
+/// The folder of the newest checkpoint, for whoever wants its weights alone; `None` for a run that has never written one.
+///
+/// # Errors
+/// When there was one and it is gone, when it is of another run or build, or cannot be read.
+pub fn latest(run_dir: &RunDir, config: &Config) -> Result<Option<PathBuf>, CheckpointError> {
+    let all = run_dir.checkpoints();
+    let folder = all.join(LATEST);
+    if !folder.join(MANIFEST).exists() {
+        return match written::newest(run_dir) {
+            Some(newest) => Err(CheckpointError::Gone { folder: all, newest }),
+            None => Ok(None),
+        };
+    }
+    let origin = load_manifest(&folder)?.origin;
+    match Origin::of(run_dir, config)?.may_go_on_from(&origin) {
+        // Settings that another training would follow from do not change what these weights do.
+        Ok(_) | Err(OtherOrigin::Setting { .. }) => Ok(Some(folder)),
+        Err(what) => Err(CheckpointError::Other { folder, what }),
     }
 }
 

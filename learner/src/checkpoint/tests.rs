@@ -204,8 +204,6 @@ fn a_run_whose_checkpoints_are_gone_is_no_new_run() {
             true => assert!(run.refusal().contains(gone), "{}", run.refusal()),
             false => {
                 assert!(run.load().unwrap().is_none(), "nothing tells of them any more");
-                fs::write(run.run_dir.summary(), "{}").unwrap();
-                assert!(run.refusal().contains("summary.json tells of it"), "{}", run.refusal());
             }
         }
         fs::remove_dir_all(run.run_dir.checkpoints()).unwrap();
@@ -373,4 +371,26 @@ fn wherever_writing_was_cut_short_the_next_learner_goes_on() {
         assert_eq!(run.load().unwrap().unwrap().state, run.state(200));
         assert!(!all(&run).join("step-000000000100-2.partial").exists());
     }
+}
+
+#[test]
+fn whoever_wants_the_weights_alone_is_told_whose_they_are() {
+    let (run, other) = (run(), run());
+    let latest = |run: &Run| latest(&run.run_dir, &run.config);
+    assert!(latest(&run).unwrap().is_none(), "none was ever written");
+    let folder = run.save(20);
+    assert_eq!(fs::canonicalize(latest(&run).unwrap().unwrap()).unwrap(), folder);
+    let mut edited = run;
+    edited.config.algorithm.gamma = 0.5;
+    assert!(latest(&edited).unwrap().is_some(), "weights do what they do");
+    fs::remove_dir_all(&folder).unwrap();
+    fs::rename(other.save(20), &folder).unwrap();
+    assert!(latest(&edited).unwrap_err().to_string().contains("it is of another run"));
+    fs::remove_dir_all(&folder).unwrap();
+    assert!(
+        latest(&edited)
+            .unwrap_err()
+            .to_string()
+            .contains("holds no checkpoint, and this run has written some")
+    );
 }

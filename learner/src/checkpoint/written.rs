@@ -5,10 +5,7 @@ use super::{CheckpointError, LATEST, io, write_whole};
 use crate::checkpoint::origin::Origin;
 use rit_config::RunDir;
 use serde::{Deserialize, Serialize};
-use std::{
-    fs,
-    path::{Path, PathBuf},
-};
+use std::{fs, path::PathBuf};
 
 #[derive(Serialize, Deserialize)]
 struct Written {
@@ -41,9 +38,5 @@ pub(super) fn newest(run_dir: &RunDir) -> Option<String> {
         return Some(written.map_or_else(|| "checkpoints.json tells of it".into(), |written| written.newest));
     }
     // What tells of it where that file is gone.
-    if let Ok(target) = fs::read_link(run_dir.checkpoints().join(LATEST)) {
-        return Some(target.display().to_string());
-    }
-    let summary = run_dir.summary();
-    Path::new(&summary).exists().then(|| "summary.json tells of it".into())
+    fs::read_link(run_dir.checkpoints().join(LATEST)).ok().map(|target| target.display().to_string())
 }
