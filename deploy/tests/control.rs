@@ -3,8 +3,9 @@
 
 mod common;
 
-use common::{RunFolder, Train, output};
+use common::{RunFolder, Train, output, rit};
 use serde_json::Value;
+use std::process::Stdio;
 
 fn json(output: &std::process::Output) -> Value {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -49,6 +50,26 @@ fn a_run_is_paused_evaluated_saved_resumed_and_stopped() {
     assert_eq!(json(&train.ctl(&["stop"]))["state"], "stopping");
     let summary = train.finish_stopped();
     assert!(summary["env_steps"].as_u64() < Some(50_000));
+}
+
+#[test]
+fn an_evaluation_ends_when_its_caller_has_gone() {
+    let folder = RunFolder::new();
+    let mut train = folder.start(&["matrix-game", "--actors", "1", "--seed", "1"]);
+    train.wait_for("training", |status| status["updates"].as_u64() > Some(10));
+    let run_dir = folder.run_dir();
+    let evaluate = ["ctl", "--run", run_dir.to_str().unwrap(), "evaluate", "--episodes", "1000000"];
+    for _ in 0..3 {
+        let mut caller = rit(&evaluate).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        // Long enough or not: it is under way, or never was.
+        train.wait_for("an answer beside it", |_| true);
+        caller.kill().unwrap();
+        caller.wait().unwrap();
+    }
+    // Its turn comes at once; after minutes the call would have ended without an answer.
+    let repeated = vec!["game-2"; 3000].join(",");
+    let evaluation = json(&train.ctl(&["evaluate", "--episodes", "20", "--tasks", &repeated]));
+    assert_eq!(evaluation["tasks"].as_array().unwrap().len(), 1, "{evaluation}");
 }
 
 #[test]

@@ -19,6 +19,7 @@ use rit_learner::{
     weights_file,
     write_queue::write_queue,
 };
+use serde_json::Value;
 use sha2::{Digest as _, Sha256};
 use std::{
     fs,
@@ -29,6 +30,7 @@ use std::{
 /// The files of a checkpoint and of its replay. The first byte of an input says which one the rest of it replaces.
 const FILES: [&str; 5] =
     ["checkpoint.json", "weights.safetensors", "state.safetensors", "000000000000.frames", "SHA256SUMS"];
+const MANIFEST: usize = 0;
 const FRAMES: usize = 3;
 const SUMS: usize = 4;
 
@@ -107,8 +109,10 @@ impl Run {
         let Some((&which, content)) = input.split_first() else { return false };
         let which = usize::from(which) % FILES.len();
         let mut content = content.to_vec();
-        if which == FRAMES {
-            self.mend_frames(&mut content);
+        match which {
+            FRAMES => self.mend_frames(&mut content),
+            MANIFEST => self.mend_manifest(&mut content),
+            _ => {}
         }
         self.write(which, &content);
         if which != SUMS {
@@ -170,6 +174,20 @@ impl Run {
             let mut mended: Header = bytemuck::pod_read_unaligned(header);
             frame::mend(&mut mended, payload);
             header.copy_from_slice(bytemuck::bytes_of(&mended));
+        }
+    }
+
+    /// A manifest's origin made right, where it is one at all: an input of another run goes no further.
+    fn mend_manifest(&self, bytes: &mut Vec<u8>) {
+        let origin = |manifest: &[u8]| {
+            serde_json::from_slice::<Value>(manifest)
+                .ok()
+                .and_then(|manifest| manifest.get("origin").cloned())
+        };
+        let Ok(Value::Object(mut manifest)) = serde_json::from_slice(bytes) else { return };
+        manifest.extend(origin(&self.whole[MANIFEST]).map(|origin| ("origin".to_owned(), origin)));
+        if let Ok(mended) = serde_json::to_vec(&manifest) {
+            *bytes = mended;
         }
     }
 
