@@ -263,6 +263,7 @@ enum SessionStatus {
 mod tests {
     use super::*;
     use crate::{checkpoint::Progress, evaluation::Exploring, measured::Measured};
+    use rit_config::OwnedRunDir;
     use std::path::PathBuf;
 
     /// The events of a file, both checksums of each verified.
@@ -298,7 +299,8 @@ mod tests {
         fn new() -> Self {
             let config = rit_config::resolve("environment.task_set = \"matrix-game\"", "test", &[]).unwrap();
             let folder = tempfile::tempdir().unwrap();
-            let run_dir = RunDir::create(&folder.path().join("run"), &config).unwrap();
+            let owned = OwnedRunDir::create(&folder.path().join("run"), &config).unwrap();
+            let run_dir = owned.run_dir().clone();
             Self { _folder: folder, run_dir }
         }
 

@@ -309,6 +309,7 @@ fn from_hex(digits: &str) -> Option<RunId> {
 mod tests {
     use super::*;
     use crate::OwnedRunDir;
+    use crate::resolve;
     use std::os::unix::{ffi::OsStrExt as _, fs::symlink};
 
     #[test]

@@ -1,4 +1,5 @@
 use super::*;
+use crate::resolve;
 use std::{os::unix::fs::symlink, process::Command, sync::Barrier, thread};
 use tempfile::TempDir;
 
