@@ -1,4 +1,5 @@
 use super::*;
+use crate::write_queue::{ToWrite, write_queue};
 use rit_algo::{Method, Model};
 use rit_config::OwnedRunDir;
 use rit_env::{
@@ -38,7 +39,7 @@ fn an_update_that_is_not_finite_ends_the_run_before_it_reaches_anything() {
         let mut params = model.initial(&mut config.seed.stream(Stream::Weights, 0));
         params.iter_mut().for_each(|weight| *weight = (*weight * 1e38).clamp(f32::MIN, f32::MAX));
         let learner = rit_algo::learner(model, config.update(), params.clone()).unwrap();
-        let (writer, written) = mpsc::channel();
+        let (writer, written) = write_queue(config.replay_episodes().max(100));
         let (trainer, board) =
             Trainer::new(config.clone(), run_dir, learner, None, Box::new(|_| ()), writer).unwrap();
         let (work, queue) = mpsc::channel();
@@ -52,7 +53,8 @@ fn an_update_that_is_not_finite_ends_the_run_before_it_reaches_anything() {
             let acting = Model::new(config.model()).unwrap().acting();
             (0, params[acting].to_vec())
         });
-        let checkpoints = written.iter().filter(|what| matches!(what, ToWrite::Checkpoint(..)));
+        let checkpoints =
+            std::iter::from_fn(|| written.next()).filter(|what| matches!(what, ToWrite::Checkpoint(_)));
         assert_eq!(checkpoints.count(), 0, "{method}");
     }
 }
