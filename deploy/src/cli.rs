@@ -253,10 +253,10 @@ pub struct SoakOptions {
     /// The algorithm, in place of the experiment's
     #[arg(long, value_name = "NAME")]
     pub algorithm: Option<String>,
-    /// Kills, spread over the run
+    /// Blows, spread over the run: kills by SIGKILL, TERM, INT, HUP and STOP, second learners, copies that are resumed
     #[arg(long, default_value_t = 10, value_parser = within::<usize>(1, 100_000))]
     pub kills: usize,
-    /// Seed of both runs, and of the moments and victims
+    /// Seed of both runs, and of what is done when: the same seed does the same
     #[arg(long, default_value_t = 1, value_parser = count)]
     pub seed: u64,
     /// Actor processes

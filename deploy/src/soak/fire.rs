@@ -1,15 +1,15 @@
-//! A run whose processes are killed.
+//! A run that something is done to, again and again.
 
+use super::schedule::{Blow, Planned};
 use crate::{child, control, failure::Failure, last_words::last_words};
-use rand::RngExt as _;
 use rit_config::RunDir;
-use rit_episode::Rng;
-use rit_proto::v1::{CheckpointRequest, RunStatus, StatusRequest};
-use rustix::process::{Pid, Signal, kill_process};
-use serde::Serialize;
+use rit_proto::v1::{ActorStatus, CheckpointRequest, PauseRequest, ResumeRequest, RunStatus, StatusRequest};
+use rustix::process::{Pid, kill_process};
 use serde_json::Value;
 use std::{
     fs::{self, File},
+    io,
+    os::unix::fs::symlink,
     path::{Path, PathBuf},
     process::Stdio,
     time::{Duration, Instant},
@@ -25,56 +25,22 @@ const PATIENCE: Duration = Duration::from_secs(60);
 /// Attempts to meet a checkpoint while it is written.
 const CHECKPOINTS_TRIED: usize = 50;
 
-/// The supervisor gives up a process that dies five times within a minute; so often each may be killed before
-/// everything is, which starts a new supervisor.
-const KILLS_PER_SUPERVISOR: usize = 3;
-
-/// What is killed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Victim {
-    /// One actor, by SIGKILL.
-    Actor,
-    /// One actor, by SIGSTOP: it is noticed by its silence.
-    StoppedActor,
-    /// The learner.
-    Learner,
-    /// The learner, while it writes a checkpoint.
-    LearnerAtCheckpoint,
-    /// All processes at once, as when the machine loses power; the run is resumed.
-    Everything,
-}
-
-impl Victim {
-    /// For people.
-    pub fn words(self) -> &'static str {
-        match self {
-            Self::Actor => "an actor",
-            Self::StoppedActor => "an actor, stopped and not killed",
-            Self::Learner => "the learner",
-            Self::LearnerAtCheckpoint => "the learner, at a checkpoint",
-            Self::Everything => "everything; the run is resumed",
-        }
-    }
-
-    fn draw(rng: &mut Rng) -> Self {
-        match rng.random_range(0..20) {
-            0..8 => Self::Actor,
-            8..9 => Self::StoppedActor,
-            9..14 => Self::Learner,
-            14..17 => Self::LearnerAtCheckpoint,
-            _ => Self::Everything,
-        }
-    }
-}
-
-/// A kill and what came of it.
+/// A blow and what came of it.
 #[derive(Clone, Copy, Debug)]
-pub struct Kill {
-    /// What was killed.
-    pub victim: Victim,
-    /// Seconds until the learner answered and counted the victim's successor.
-    pub restart_s: f64,
+pub struct Dealt {
+    /// What was done.
+    pub blow: Blow,
+    /// Seconds until all was well again: the learner answers and counts the victim's successor.
+    pub recovery_s: f64,
+}
+
+/// Whether anybody reads what a `rit train` says.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Output {
+    /// A file beside the run's directory.
+    Log,
+    /// Nobody: the other end of its pipes is closed.
+    Closed,
 }
 
 /// What is waited for.
@@ -91,8 +57,10 @@ enum Wait {
 pub struct Run {
     root: PathBuf,
     train: Child,
-    /// Kills since this supervisor started.
-    killed: usize,
+    /// Until when a `rit train --resume` that is refused is tried again: what was killed may not be gone yet.
+    resuming_until: Option<(Instant, Output)>,
+    /// Copies of the run that go on beside it.
+    copies: Vec<Self>,
     ledger_checks: u64,
 }
 
@@ -104,7 +72,12 @@ impl Run {
     pub fn start(experiment: &str, settings: &[String], root: &Path) -> Result<Self, Failure> {
         let mut arguments = vec![experiment.to_owned(), "--run-dir".to_owned(), root.display().to_string()];
         arguments.extend(settings.iter().flat_map(|setting| ["--set".to_owned(), setting.clone()]));
-        Ok(Self { root: root.to_owned(), train: train(&arguments, root)?, killed: 0, ledger_checks: 0 })
+        Ok(Self::of(root, train(&arguments, root, Output::Log)?))
+    }
+
+    fn of(root: &Path, train: Child) -> Self {
+        let root = root.to_owned();
+        Self { root, train, resuming_until: None, copies: Vec::new(), ledger_checks: 0 }
     }
 
     /// Looks at the ledger, each of which found it sound.
@@ -112,11 +85,20 @@ impl Run {
         self.ledger_checks
     }
 
-    /// Waits for the end; returns the summary.
+    /// Waits for the end, and for that of the copies; returns the summaries, the copies' last.
     ///
     /// # Errors
-    /// When the run fails.
-    pub async fn finish(mut self) -> Result<Value, Failure> {
+    /// When a run fails.
+    pub async fn finish(mut self) -> Result<Vec<Value>, Failure> {
+        let mut summaries = Vec::new();
+        summaries.push(self.end().await?);
+        for mut copy in std::mem::take(&mut self.copies) {
+            summaries.push(copy.end().await?);
+        }
+        Ok(summaries)
+    }
+
+    async fn end(&mut self) -> Result<Value, Failure> {
         let status = self.train.wait().await.map_err(Failure::runtime)?;
         if !status.success() {
             return Err(self.failed());
@@ -125,76 +107,131 @@ impl Run {
         serde_json::from_slice(&text).map_err(Failure::runtime)
     }
 
-    /// Kills so many times, at random moments spread over the whole run.
+    /// Does what is planned.
     ///
     /// # Errors
-    /// When the run fails or ends too early, when a successor does not come, or when the ledger does not add up.
+    /// When the run fails or ends too early, when it does not recover, or when the ledger does not add up.
     pub async fn under_fire(
         &mut self,
-        kills: usize,
-        env_steps: u64,
-        rng: &mut Rng,
+        schedule: &[Planned],
         say: &dyn Fn(&str),
-    ) -> Result<Vec<Kill>, Failure> {
-        let mut done = Vec::with_capacity(kills);
-        for index in 0..kills {
-            // The last tenth is left in peace, else a kill might come after the end.
-            let moment = (index as f64 + rng.random::<f64>()) / kills as f64 * 0.9 * env_steps as f64;
-            let status = self.wait_for(Wait::Progress, |status| status.env_steps as f64 >= moment).await?;
-            let drawn = Victim::draw(rng);
-            let victim = if self.killed < KILLS_PER_SUPERVISOR { drawn } else { Victim::Everything };
-            let actor = rng.random_range(0..status.actors.len().max(1));
-            let kill = self.kill(victim, &status, actor).await?;
-            let words = victim.words();
+    ) -> Result<Vec<Dealt>, Failure> {
+        let mut done = Vec::with_capacity(schedule.len());
+        for &planned in schedule {
+            let status =
+                self.wait_for(Wait::Progress, |status| status.env_steps as f64 >= planned.at).await?;
+            let (blow, begun) = (planned.blow, Instant::now());
+            let waited = self.deal(planned, &status).await?;
+            let recovery_s = (begun.elapsed() - waited).as_secs_f64();
             say(&format!(
-                "{:>8} steps: {words} killed, back after {:.2} s",
-                status.env_steps, kill.restart_s
+                "{:>8} steps: {}, well again after {recovery_s:.2} s",
+                status.env_steps,
+                blow.words()
             ));
-            done.push(kill);
+            done.push(Dealt { blow, recovery_s });
         }
         Ok(done)
     }
 
-    async fn kill(&mut self, victim: Victim, status: &RunStatus, actor: usize) -> Result<Kill, Failure> {
-        self.killed += 1;
-        let (learner, actors) = (status.pid, status.actors.len());
-        let mut begun = Instant::now();
-        match victim {
-            Victim::Actor | Victim::StoppedActor => {
-                let (name, pid) = (status.actors[actor].name.clone(), status.actors[actor].pid);
-                signal(pid, if victim == Victim::Actor { Signal::KILL } else { Signal::STOP })?;
-                self.wait_for(Wait::Successor, |status| {
-                    status.actors.iter().any(|actor| actor.name == name && actor.pid != pid)
-                })
-                .await?;
+    /// Deals a blow and waits until all is well again. Returns how long it was waited for its moment.
+    async fn deal(&mut self, planned: Planned, status: &RunStatus) -> Result<Duration, Failure> {
+        let (learner, actors, blow) = (status.pid, status.actors.len(), planned.blow);
+        let begun = Instant::now();
+        let mut waited = Duration::ZERO;
+        match blow {
+            Blow::ActorKilled
+            | Blow::ActorTold
+            | Blow::ActorInterrupted
+            | Blow::ActorHungUp
+            | Blow::ActorStopped => {
+                let Some(actor) = status.actors.get(planned.which % actors.max(1)) else { return Ok(waited) };
+                let (name, pid) = (actor.name.clone(), actor.pid);
+                send(pid, blow)?;
+                let there = |actor: &ActorStatus| actor.name == name && actor.pid != pid;
+                self.wait_for(Wait::Successor, |status| status.actors.iter().any(there)).await?;
+                return Ok(waited);
             }
-            Victim::Learner | Victim::LearnerAtCheckpoint => {
-                if victim == Victim::LearnerAtCheckpoint {
-                    self.meet_a_checkpoint().await?;
-                    begun = Instant::now();
-                }
-                signal(learner, Signal::KILL)?;
-                self.wait_for(Wait::Successor, |status| {
-                    status.pid != learner && status.actors.len() >= actors
-                })
-                .await?;
+            Blow::LearnerKilled | Blow::LearnerHungUp | Blow::LearnerStopped | Blow::LearnerTold => {
+                send(learner, blow)?;
             }
-            Victim::Everything => {
+            Blow::LearnerKilledAtCheckpoint => {
+                self.meet_a_checkpoint().await?;
+                waited = begun.elapsed();
+                send(learner, blow)?;
+            }
+            Blow::TrainTold | Blow::TrainHungUp | Blow::OutputClosed => {
+                send(self.train.id().unwrap_or_default(), blow)?;
+                let output = if blow == Blow::OutputClosed { Output::Closed } else { Output::Log };
+                self.resume(output).await?;
+            }
+            Blow::Everything => {
                 // The supervisor first, else it would begin to put things right.
                 self.train.start_kill().map_err(Failure::runtime)?;
                 for pid in std::iter::once(learner).chain(status.actors.iter().map(|actor| actor.pid)) {
-                    signal(pid, Signal::KILL)?;
+                    send(pid, blow)?;
                 }
-                self.train.wait().await.map_err(Failure::runtime)?;
-                self.train = train(&["--resume".to_owned(), self.root.display().to_string()], &self.root)?;
-                self.killed = 0;
-                self.wait_for(Wait::Successor, |status| {
-                    status.pid != learner && status.actors.len() >= actors
-                })
-                .await?;
+                self.resume(Output::Log).await?;
+            }
+            Blow::SecondLearner => {
+                self.second_is_refused(&["learner", "--run-dir"]).await?;
+                self.second_is_refused(&["train", "--json", "--resume"]).await?;
+                let same = |status: &RunStatus| status.pid == learner;
+                self.wait_for(Wait::Successor, same).await?;
+                return Ok(waited);
+            }
+            Blow::Copied => {
+                self.copy().await?;
+                return Ok(waited);
             }
         }
-        Ok(Kill { victim, restart_s: begun.elapsed().as_secs_f64() })
+        self.wait_for(Wait::Successor, |status| status.pid != learner && status.actors.len() >= actors)
+            .await?;
+        Ok(waited)
+    }
+
+    /// Waits for the supervisor's end and starts another.
+    async fn resume(&mut self, output: Output) -> Result<(), Failure> {
+        let ended = tokio::time::timeout(PATIENCE, self.train.wait()).await;
+        let stays = |_| Failure::runtime_message("rit train was told to end and does not");
+        ended.map_err(stays)?.map_err(Failure::runtime)?;
+        self.train = resumed(&self.root, output)?;
+        self.resuming_until = Some((Instant::now() + PATIENCE, output));
+        Ok(())
+    }
+
+    /// Another process for the same run does nothing to it.
+    async fn second_is_refused(&self, command: &[&str]) -> Result<(), Failure> {
+        let second = Command::from(child::this_program())
+            .args(command)
+            .arg(&self.root)
+            .stdin(Stdio::null())
+            .kill_on_drop(true)
+            .output();
+        let second = second.await.map_err(Failure::runtime)?;
+        if second.status.code() == Some(2) {
+            return Ok(());
+        }
+        let words = String::from_utf8_lossy(&second.stderr).into_owned();
+        let command = command.join(" ");
+        Err(Failure::runtime_message(format!(
+            "a second {command} was not refused: {} {words}",
+            second.status
+        )))
+    }
+
+    /// Copies the run while it rests at a checkpoint, and resumes the copy beside it.
+    async fn copy(&mut self) -> Result<(), Failure> {
+        let (run_dir, _) = RunDir::open(&self.root)?;
+        let mut control = control::connect(&run_dir).await?;
+        control.pause(PauseRequest {}).await?;
+        control.checkpoint(CheckpointRequest {}).await?;
+        let name = self.root.file_name().unwrap_or_default().to_string_lossy();
+        let root = self.root.with_file_name(format!("{name}-copy-{}", self.copies.len() + 1));
+        copy_folder(&self.root, &root).map_err(Failure::runtime)?;
+        control.resume(ResumeRequest {}).await?;
+        let copy = Self::of(&root, resumed(&root, Output::Log)?);
+        self.copies.push(copy);
+        Ok(())
     }
 
     /// Asks for checkpoints until one is seen half written.
@@ -229,7 +266,13 @@ impl Run {
         let mut control = None;
         loop {
             if self.train.try_wait().map_err(Failure::runtime)?.is_some() {
-                return Err(self.failed());
+                // What was killed holds the run until it is gone.
+                match self.resuming_until {
+                    Some((until, output)) if Instant::now() < until => {
+                        self.train = resumed(&self.root, output)?;
+                    }
+                    _ => return Err(self.failed()),
+                }
             }
             if control.is_none() {
                 control = match RunDir::open(&self.root) {
@@ -243,6 +286,7 @@ impl Run {
                     Ok(status) => {
                         let status = status.into_inner();
                         self.check_ledger(&status)?;
+                        self.resuming_until = None;
                         if wanted(&status) {
                             return Ok(status);
                         }
@@ -280,18 +324,50 @@ impl Run {
     }
 }
 
-/// Starts `rit train`; what it says goes to a file beside the run's directory.
-fn train(arguments: &[String], root: &Path) -> Result<Child, Failure> {
-    let log = File::options().create(true).append(true).open(log(root)).map_err(Failure::runtime)?;
+/// Starts `rit train`.
+fn train(arguments: &[String], root: &Path, output: Output) -> Result<Child, Failure> {
+    let (stdout, stderr): (Stdio, Stdio) = match output {
+        Output::Log => {
+            let log = File::options().create(true).append(true).open(log(root)).map_err(Failure::runtime)?;
+            (Stdio::null(), log.into())
+        }
+        Output::Closed => {
+            let (_, stdout) = io::pipe().map_err(Failure::runtime)?;
+            let (_, stderr) = io::pipe().map_err(Failure::runtime)?;
+            (stdout.into(), stderr.into())
+        }
+    };
     Command::from(child::this_program())
-        .args(["train", "--json"])
+        .arg("train")
         .args(arguments)
         .stdin(Stdio::null())
-        .stdout(Stdio::null())
-        .stderr(log)
+        .stdout(stdout)
+        .stderr(stderr)
         .kill_on_drop(true)
         .spawn()
         .map_err(Failure::runtime)
+}
+
+fn resumed(root: &Path, output: Output) -> Result<Child, Failure> {
+    train(&["--resume".to_owned(), root.display().to_string()], root, output)
+}
+
+/// Files and folders; what is neither, such as a socket, is left out.
+fn copy_folder(from: &Path, to: &Path) -> io::Result<()> {
+    fs::create_dir(to)?;
+    fs::set_permissions(to, fs::metadata(from)?.permissions())?;
+    for entry in fs::read_dir(from)? {
+        let entry = entry?;
+        let (kind, to) = (entry.file_type()?, to.join(entry.file_name()));
+        if kind.is_dir() {
+            copy_folder(&entry.path(), &to)?;
+        } else if kind.is_symlink() {
+            symlink(fs::read_link(entry.path())?, &to)?;
+        } else if kind.is_file() {
+            fs::copy(entry.path(), &to)?;
+        }
+    }
+    Ok(())
 }
 
 fn log(root: &Path) -> PathBuf {
@@ -303,7 +379,8 @@ fn is_partial(checkpoints: &Path) -> bool {
     names.into_iter().any(|name| name.to_string_lossy().contains("partial"))
 }
 
-fn signal(pid: u32, signal: Signal) -> Result<(), Failure> {
+fn send(pid: u32, blow: Blow) -> Result<(), Failure> {
+    let Some(signal) = blow.signal() else { return Ok(()) };
     let Some(pid) = i32::try_from(pid).ok().and_then(Pid::from_raw) else {
         return Err(Failure::runtime_message(format!("{pid} is no process")));
     };

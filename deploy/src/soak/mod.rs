@@ -1,14 +1,16 @@
-//! `rit soak`: trains a run while its processes are killed again and again, and holds its end to that of the same
-//! run left in peace. Nothing may be lost, nothing may come twice, and the weights must be the same to the last bit.
+//! `rit soak`: trains a run while its processes are killed, stopped and told to end again and again, while others are
+//! started for it and copies of it go on, and holds its end to that of the same run left in peace. Nothing may be lost, nothing may come twice, and the weights must be the same to the last bit.
 
 mod fire;
+mod schedule;
 mod simulated;
 
 use crate::{cli::SoakOptions, experiments, failure::Failure, output};
-use fire::{Kill, Run, Victim};
+use fire::{Dealt, Run};
 use rit_config::RunDir;
-use rit_episode::{Episode, RunSeed, Stream, wire::Expected};
+use rit_episode::{Episode, wire::Expected};
 use rit_learner::replay_log;
+use schedule::Blow;
 use serde::Serialize;
 use serde_json::Value;
 use std::{collections::BTreeMap, fs, path::Path, process::ExitCode};
@@ -17,7 +19,9 @@ use std::{collections::BTreeMap, fs, path::Path, process::ExitCode};
 #[derive(Debug, Serialize)]
 struct Report {
     kills: usize,
-    by_victim: BTreeMap<Victim, Times>,
+    by_blow: BTreeMap<Blow, Times>,
+    /// Copies that were resumed beside the run, all of which ended as the run itself.
+    copies: usize,
     /// Looks at the ledger, all of them with `handed_out = inserted + rejected + outstanding`.
     ledger_checks: u64,
     episodes: u64,
@@ -31,12 +35,12 @@ struct Report {
     same: bool,
 }
 
-/// From a kill to the moment the learner counts the victim's successor.
+/// From a blow to the moment that all is well again: the learner answers and counts the victim's successor.
 #[derive(Debug, Default, Serialize)]
 struct Times {
     kills: usize,
-    mean_restart_s: f64,
-    max_restart_s: f64,
+    mean_recovery_s: f64,
+    max_recovery_s: f64,
 }
 
 /// `rit soak`.
@@ -76,17 +80,17 @@ pub async fn run(options: SoakOptions) -> Result<ExitCode, Failure> {
     };
     say(&format!("{}: once undisturbed", options.experiment));
     let undisturbed = Run::start(&options.experiment, &settings, &folder.join("undisturbed"))?;
-    let expected = undisturbed.finish().await?;
+    let expected = undisturbed.finish().await?.swap_remove(0);
 
     say(&format!("and once with {} kills", options.kills));
     settings.push(format!("checkpoints.every_env_steps={every}"));
     let mut run = Run::start(&options.experiment, &settings, &folder.join("disturbed"))?;
-    let mut rng = RunSeed(options.seed).derive("soak", 0).stream(Stream::Exploration, 0);
-    let kills = run.under_fire(options.kills, config.training.t_max, &mut rng, &say).await?;
+    let schedule = schedule::draw(options.seed, options.kills, config.training.t_max);
+    let kills = run.under_fire(&schedule, &say).await?;
     let ledger_checks = run.ledger_checks();
-    let found = run.finish().await?;
+    let ended = run.finish().await?;
 
-    let report = compare(folder, &kills, ledger_checks, &expected, &found)?;
+    let report = compare(folder, &kills, ledger_checks, &expected, &ended)?;
     output::print(&if options.json {
         serde_json::to_string_pretty(&report).map_err(Failure::runtime)? + "\n"
     } else {
@@ -97,27 +101,29 @@ pub async fn run(options: SoakOptions) -> Result<ExitCode, Failure> {
 
 fn compare(
     folder: &Path,
-    kills: &[Kill],
+    kills: &[Dealt],
     ledger_checks: u64,
     expected: &Value,
-    found: &Value,
+    ended: &[Value],
 ) -> Result<Report, Failure> {
     let (undisturbed, disturbed) = (replay(&folder.join("undisturbed"))?, replay(&folder.join("disturbed"))?);
     let count = |summary: &Value| summary["episodes"].as_u64().unwrap_or_default();
     let digest = |summary: &Value| summary["weights_digest"].as_str().unwrap_or_default().to_owned();
+    let found = &ended[0];
     let same_summary = ["weights_digest", "env_steps", "episodes", "updates", "evaluation"]
         .iter()
-        .all(|&key| expected[key] == found[key]);
-    let mut by_victim: BTreeMap<Victim, Times> = BTreeMap::new();
-    for Kill { victim, restart_s } in kills {
-        let times = by_victim.entry(*victim).or_default();
+        .all(|&key| ended.iter().all(|summary| expected[key] == summary[key]));
+    let mut by_blow: BTreeMap<Blow, Times> = BTreeMap::new();
+    for Dealt { blow, recovery_s } in kills {
+        let times = by_blow.entry(*blow).or_default();
         times.kills += 1;
-        times.mean_restart_s += (restart_s - times.mean_restart_s) / times.kills as f64;
-        times.max_restart_s = times.max_restart_s.max(*restart_s);
+        times.mean_recovery_s += (recovery_s - times.mean_recovery_s) / times.kills as f64;
+        times.max_recovery_s = times.max_recovery_s.max(*recovery_s);
     }
     Ok(Report {
         kills: kills.len(),
-        by_victim,
+        by_blow,
+        copies: ended.len().saturating_sub(1),
         ledger_checks,
         episodes: count(found),
         episodes_compared: disturbed.len() as u64,
@@ -142,10 +148,10 @@ fn replay(root: &Path) -> Result<Vec<Episode>, Failure> {
 }
 
 fn table(report: &Report) -> String {
-    let mut text = format!("{:<34}{:>6}{:>16}{:>16}\n", "killed", "kills", "mean restart", "longest restart");
-    for (victim, times) in &report.by_victim {
-        let Times { kills, mean_restart_s, max_restart_s } = times;
-        text += &format!("{:<34}{kills:>6}{mean_restart_s:>14.2} s{max_restart_s:>14.2} s\n", victim.words());
+    let mut text = format!("{:<38}{:>6}{:>16}{:>16}\n", "what was done", "times", "mean recovery", "longest");
+    for (blow, times) in &report.by_blow {
+        let Times { kills, mean_recovery_s, max_recovery_s } = times;
+        text += &format!("{:<38}{kills:>6}{mean_recovery_s:>14.2} s{max_recovery_s:>14.2} s\n", blow.words());
     }
     let Report { ledger_checks, episodes, episodes_compared, lost, duplicated, .. } = report;
     text += &format!(

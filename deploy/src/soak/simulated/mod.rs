@@ -3,8 +3,10 @@
 //! its seed, and takes a fraction of a millisecond.
 
 mod actor;
+mod children;
 mod faults;
 mod learner;
+mod suffering;
 #[cfg(test)]
 mod tests;
 mod world;

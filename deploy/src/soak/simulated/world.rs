@@ -6,7 +6,7 @@ use super::{
     faults::{Fault, Plan},
     learner::{Learner, Saved, episode},
 };
-use crate::supervisor::{Effect, Event, Exit, Hung, Outcome, Place, Standing, Supervisor};
+use crate::supervisor::{Effect, Event, Exit, Outcome, Place, Supervisor};
 use rand::RngExt as _;
 use rit_config::Config;
 use rit_episode::{Rng, RunSeed, Stream};
@@ -16,10 +16,9 @@ use rit_learner::{
     receive::Fence,
     summary::Ended,
 };
-use rit_proto::v1::RunState;
 use std::{
     cmp::Ordering,
-    collections::{BTreeMap, BTreeSet, BinaryHeap, VecDeque},
+    collections::{BTreeMap, BinaryHeap, VecDeque},
     ops::Range,
     sync::Arc,
     time::Duration,
@@ -29,10 +28,10 @@ use std::{
 const PEACE_MAX: Duration = Duration::from_secs(400);
 
 /// The supervisor looks at the run this often.
-const POLL_EVERY: Duration = Duration::from_secs(1);
+pub const POLL_EVERY: Duration = Duration::from_secs(1);
 
 /// A question that gets no answer is given up after so long.
-const ASK_TIMEOUT: Duration = Duration::from_secs(4);
+pub const ASK_TIMEOUT: Duration = Duration::from_secs(4);
 
 /// No scenario takes so many events.
 const EVENTS_MAX: u64 = 200_000;
@@ -157,10 +156,10 @@ pub struct Process {
     pub number: usize,
     pub place: Place,
     /// Whose child it is.
-    supervisor: u32,
+    pub(super) supervisor: u32,
     pub dead: bool,
     /// By SIGSTOP, with what it will find when it goes on.
-    stopped: Option<Vec<What>>,
+    pub(super) stopped: Option<Vec<What>>,
     /// Told to end in order.
     pub leaving: bool,
     pub actor: Actor,
@@ -222,18 +221,18 @@ pub struct World<M: Machines> {
     /// A learner has answered this supervisor.
     pub begun: bool,
     /// Somebody has ended the run before its time.
-    may_end_early: bool,
-    latency_ms: u64,
-    rng: Rng,
+    pub(super) may_end_early: bool,
+    pub(super) latency_ms: u64,
+    pub(super) rng: Rng,
     queue: BinaryHeap<Scheduled>,
     order: u64,
     /// The supervisor that there is, and how many there were before.
-    supervisor: Option<M::Supervisor>,
-    supervisors: u32,
-    contacted: bool,
-    children: BTreeMap<Place, usize>,
-    peace_since: Option<Duration>,
-    outcome: Option<Outcome>,
+    pub(super) supervisor: Option<M::Supervisor>,
+    pub(super) supervisors: u32,
+    pub(super) contacted: bool,
+    pub(super) children: BTreeMap<Place, usize>,
+    pub(super) peace_since: Option<Duration>,
+    pub(super) outcome: Option<Outcome>,
     broken: Option<String>,
     course: Option<Vec<String>>,
 }
@@ -435,300 +434,11 @@ impl<M: Machines> World<M> {
         self.broken.get_or_insert(what);
     }
 
-    fn notes(&mut self, what: impl FnOnce() -> String) {
+    pub(super) fn notes(&mut self, what: impl FnOnce() -> String) {
         let now = self.now;
         if let Some(course) = &mut self.course {
             course.push(format!("{:>10.3} {}", now.as_secs_f64(), what()));
         }
-    }
-
-    // The supervisor and its children.
-
-    fn begin_supervisor(&mut self) {
-        self.supervisors += 1;
-        self.supervisor = Some(M::Supervisor::new(self.config.actors.count as u32));
-        (self.contacted, self.begun) = (false, false);
-        self.tell_supervisor(Event::Begin);
-        self.after(POLL_EVERY, What::Poll(self.supervisors));
-    }
-
-    fn tell_supervisor(&mut self, event: Event) {
-        let mut events = VecDeque::from([event]);
-        while let Some(event) = events.pop_front() {
-            let now = self.now;
-            let Some(supervisor) = &mut self.supervisor else { return };
-            for effect in supervisor.handle(event, now) {
-                self.notes(|| format!("  {effect:?}"));
-                events.extend(self.supervisor_does(effect));
-            }
-        }
-    }
-
-    fn supervisor_does(&mut self, effect: Effect) -> Option<Event> {
-        match effect {
-            Effect::Start(place) => return Some(self.starts(place)),
-            Effect::AskToEnd(place) => {
-                if let Some(&process) = self.children.get(&place) {
-                    let delay = self.latency();
-                    self.after(delay, What::Asked(process));
-                }
-            }
-            Effect::Kill(place) => {
-                if let Some(&process) = self.children.get(&place) {
-                    self.dies(process, Exit::Signal(9));
-                }
-            }
-            Effect::StopRun => {
-                let delay = self.latency();
-                self.after(delay, What::Control(Control::Stop { drain: false }));
-            }
-            Effect::RemoveSharedMemory => {
-                if !self.children.is_empty() {
-                    self.breaks(format!("shared memory of {:?} is removed", self.children.keys()));
-                }
-            }
-            Effect::Say(_) => {}
-            Effect::Over(outcome) => {
-                if !self.children.is_empty() {
-                    self.breaks(format!("the run is over, and there are {:?}", self.children.keys()));
-                }
-                self.outcome = Some(outcome);
-            }
-        }
-        None
-    }
-
-    fn starts(&mut self, place: Place) -> Event {
-        let number = self.processes.len();
-        let actor = Actor { gone_since: self.now, ..Actor::default() };
-        let supervisor = self.supervisors;
-        let process =
-            Process { number, place, supervisor, dead: false, stopped: None, leaving: false, actor };
-        let pid = process.pid();
-        self.processes.push(process);
-        if let Some(before) = self.children.insert(place, number) {
-            self.breaks(format!("{place} is process {before} and is started as process {number} too"));
-        }
-        if place == Place::Learner {
-            self.contacted = false;
-        }
-        let time = self.millis(5..300);
-        self.after(time, What::Begins(number));
-        Event::Started(place, pid)
-    }
-
-    fn begins(&mut self, process: usize) {
-        match self.processes[process].place {
-            Place::Learner => self.learner_begins(process),
-            // Memory that cannot be had is a signal to whoever writes to it.
-            Place::Actor(_) if self.now < self.memory_full_until => self.dies(process, Exit::Signal(7)),
-            Place::Actor(_) => self.connects(process),
-        }
-    }
-
-    /// A process ends, whatever of.
-    pub fn dies(&mut self, process: usize, exit: Exit) {
-        if std::mem::replace(&mut self.processes[process].dead, true) {
-            return;
-        }
-        self.tally.deaths += 1;
-        let Process { place, supervisor, .. } = self.processes[process];
-        self.notes(|| format!("  {place}, process {process}, {exit}"));
-        if place == Place::Learner {
-            self.learner = None;
-            for link in 0..self.links.len() {
-                let Link { process: actor, learner, .. } = self.links[link];
-                if learner == process && !self.processes[actor].dead {
-                    self.down(link, Down::End);
-                }
-            }
-        } else if let Some(link) = self.processes[process].actor.link {
-            // Now and then the learner notices only after the successor has come.
-            if self.rng.random_range(0..4) == 0 {
-                self.links[link].next_up = self.now + self.millis(0..3000);
-            }
-            self.up(link, Up::End);
-        }
-        let delay = self.latency();
-        self.after(delay, What::Reaped(supervisor, place, exit));
-    }
-
-    fn reaped(&mut self, supervisor: u32, place: Place, exit: Exit) {
-        if supervisor == self.supervisors && self.supervisor.is_some() {
-            self.children.remove(&place);
-            self.tell_supervisor(Event::Ended { place, exit, last_words: "its last words".into() });
-        }
-    }
-
-    fn is_asked(&mut self, process: usize) {
-        match self.processes[process].place {
-            Place::Actor(_) => self.leaves(process),
-            Place::Learner if self.learner.is_some() => {
-                self.learner_is_asked(Input::Stop { drain: false, ended: Ended::Interrupted });
-            }
-            // It hears of it once it has begun.
-            Place::Learner => {
-                let wait = self.millis(50..100);
-                self.after(wait, What::Asked(process));
-            }
-        }
-    }
-
-    /// The supervisor asks the learner how the run stands.
-    fn polls(&mut self, supervisor: u32) {
-        if supervisor != self.supervisors || self.supervisor.is_none() {
-            return;
-        }
-        let answers =
-            self.learner.as_ref().is_some_and(|learner| self.processes[learner.life].stopped.is_none());
-        let event = match (answers, self.contacted) {
-            (true, false) => {
-                (self.contacted, self.begun) = (true, true);
-                Some(Event::Answers)
-            }
-            (true, true) => self.status(),
-            (false, _) => {
-                self.children.contains_key(&Place::Learner).then(|| Event::NoAnswer("silent".into()))
-            }
-        };
-        if let Some(event) = event {
-            self.tell_supervisor(event);
-        }
-        self.after(if answers { POLL_EVERY } else { ASK_TIMEOUT }, What::Poll(supervisor));
-    }
-
-    fn status(&mut self) -> Option<Event> {
-        let now = self.now;
-        let learner = self.learner.as_ref()?;
-        let status = learner.status(now);
-        let stands = now.saturating_sub(learner.moved);
-        let says = learner.coordinator.stands_still().is_some();
-        let hung = status.actors.iter().filter(|actor| actor.hung);
-        let standing = Standing {
-            actors_wanted: status.actors_wanted,
-            hung: hung.map(|actor| Hung { pid: actor.pid, silent_s: actor.silent_s as u64 }).collect(),
-            ending: status.state() == RunState::Stopping,
-        };
-        let names: BTreeSet<&str> = status.actors.iter().map(|actor| actor.name.as_str()).collect();
-        if names.len() != status.actors.len() {
-            self.breaks(format!("the learner counts a slot twice: {:?}", status.actors));
-        } else if status.state() == RunState::Running
-            && stands > Duration::from_millis(self.config.learner.stall_timeout_ms) + Duration::from_secs(60)
-            && !says
-        {
-            self.breaks(format!("the run stands still for {} s and does not say why", stands.as_secs()));
-        }
-        Some(Event::Status(standing))
-    }
-
-    // What is done to the run.
-
-    /// A child that lives, and whether it is the learner.
-    fn victim(&self, which: usize) -> Option<usize> {
-        let living: Vec<usize> =
-            self.children.values().copied().filter(|&process| !self.processes[process].dead).collect();
-        (!living.is_empty()).then(|| living[which % living.len()])
-    }
-
-    fn suffers(&mut self, fault: Fault) {
-        match fault {
-            Fault::Signal { which, signal } => {
-                let Some(victim) = self.victim(which) else { return };
-                if matches!(signal, 2 | 15) {
-                    self.may_end_early |= self.processes[victim].place == Place::Learner;
-                    self.after(Duration::ZERO, What::Asked(victim));
-                } else {
-                    self.dies(victim, Exit::Signal(signal));
-                }
-            }
-            Fault::Stop { which, ms } => {
-                let Some(victim) = self.victim(which) else { return };
-                self.processes[victim].stopped.get_or_insert_default();
-                self.after(Duration::from_millis(ms), What::GoesOn(victim));
-            }
-            Fault::Count(count) => self.set_config(|config| config.actors.count = count as usize),
-            Fault::Pause { ms } => {
-                self.learner_is_asked(Input::Pause);
-                self.after(Duration::from_millis(ms), What::Control(Control::Resume));
-            }
-            Fault::DiskFull { ms } => self.disk_full_until = self.now + Duration::from_millis(ms),
-            Fault::MemoryFull { ms } => self.memory_full_until = self.now + Duration::from_millis(ms),
-            Fault::Damage { frames } => self.damaged_frames += frames,
-            Fault::BreakLink { which } => self.breaks_link(which),
-            Fault::Slow { ms } => self.latency_ms = ms + 1,
-            Fault::PowerLoss => self.loses_power(),
-            Fault::KillSupervisor => self.loses_supervisor(),
-            Fault::Interrupt => {
-                self.may_end_early = true;
-                // One that does not answer is ended otherwise than in order.
-                self.may_fail = true;
-                self.tell_supervisor(Event::Interrupted);
-            }
-            Fault::StopRun { drain } => {
-                self.may_end_early |= self.learner.is_some();
-                self.after(Duration::ZERO, What::Control(Control::Stop { drain }));
-            }
-        }
-    }
-
-    fn breaks_link(&mut self, which: usize) {
-        let Some(victim) = self.victim(which) else { return };
-        if let Some(link) = self.processes[victim].actor.link {
-            self.up(link, Up::End);
-            self.down(link, Down::End);
-        }
-    }
-
-    fn loses_power(&mut self) {
-        if self.supervisor.take().is_none() {
-            return;
-        }
-        for process in std::mem::take(&mut self.children).into_values() {
-            self.dies(process, Exit::Signal(9));
-        }
-        let wait = self.millis(500..2000);
-        self.after(wait, What::Resumed);
-    }
-
-    /// Its children find that their lifelines are closed; one that is stopped finds it later.
-    fn loses_supervisor(&mut self) {
-        if self.supervisor.take().is_none() {
-            return;
-        }
-        for process in std::mem::take(&mut self.children).into_values() {
-            if self.processes[process].place == Place::Learner {
-                self.goes_on(process);
-            }
-            let delay = self.latency();
-            self.after(delay, What::Asked(process));
-        }
-        self.after(Duration::from_millis(500), What::Resumed);
-    }
-
-    /// `rit train --resume`, which is refused while a learner lives.
-    fn is_resumed(&mut self) {
-        let learner_lives =
-            self.processes.iter().any(|process| process.place == Place::Learner && !process.dead);
-        if learner_lives {
-            self.after(Duration::from_millis(500), What::Resumed);
-        } else {
-            self.begin_supervisor();
-        }
-    }
-
-    fn goes_on(&mut self, process: usize) {
-        for what in self.processes[process].stopped.take().into_iter().flatten() {
-            self.at(self.now, what);
-        }
-    }
-
-    fn peace(&mut self) {
-        self.peace_since = Some(self.now);
-        (self.disk_full_until, self.memory_full_until, self.damaged_frames) = (self.now, self.now, 0);
-        for process in 0..self.processes.len() {
-            self.goes_on(process);
-        }
-        self.after(Duration::ZERO, What::Control(Control::Resume));
     }
 
     /// Whether the run came to the end that it should have.
