@@ -162,6 +162,7 @@ impl Row {
 #[derive(Clone, Debug)]
 pub struct Translation {
     set: CombatSet,
+    max_reward: f64,
     pathing: Pathing,
     rows: Vec<Row>,
     n_allies: usize,
@@ -171,7 +172,14 @@ pub struct Translation {
 impl Translation {
     /// A view of battles of this set.
     pub fn new(set: CombatSet) -> Self {
-        Self { set, pathing: Pathing::default(), rows: Vec::new(), n_allies: 0, steps: 0 }
+        Self {
+            set,
+            max_reward: set.max_reward(),
+            pathing: Pathing::default(),
+            rows: Vec::new(),
+            n_allies: 0,
+            steps: 0,
+        }
     }
 
     /// Which cells can be walked from now on.
@@ -373,7 +381,7 @@ impl Translation {
         }
         let (over, won) = self.outcome();
         let reward = earned.abs() + if won { WIN_REWARD } else { 0.0 };
-        let reward = (reward * REWARD_SCALE / self.set.max_reward()) as f32;
+        let reward = (reward * REWARD_SCALE / self.max_reward) as f32;
         let end = if over {
             Some(End::Terminated)
         } else {

@@ -82,6 +82,10 @@ pub struct World {
     kinds: Vec<UnitType>,
     sides: Vec<Side>,
     stats: Vec<Stats>,
+    // What the inner loops read of the stats.
+    radii: Vec<f64>,
+    separations: Vec<f64>,
+    layers: Vec<Layer>,
     positions: Vec<Point>,
     health: Vec<f64>,
     shield: Vec<f64>,
@@ -102,6 +106,8 @@ pub struct World {
     busy_until: Vec<i64>,
     /// Which side a unit passes standing bodies on, while it goes round them.
     detours: Vec<Option<f64>>,
+    /// Whether bodies may overlap although nobody has moved.
+    crowded: bool,
     effects: Vec<Effect>,
     orders_refused: u64,
     /// Health and shield lost to hits so far, and gained by healing and recovery, by side.
@@ -127,6 +133,10 @@ impl World {
         self.kinds.clear();
         self.sides.clear();
         self.stats.clear();
+        self.radii.clear();
+        self.separations.clear();
+        self.layers.clear();
+        self.crowded = true;
         self.positions.clear();
         self.health.clear();
         self.shield.clear();
@@ -162,6 +172,9 @@ impl World {
         self.kinds.push(kind);
         self.sides.push(side);
         self.stats.push(stats);
+        self.radii.push(stats.radius);
+        self.separations.push(stats.separation);
+        self.layers.push(stats.layer);
         self.positions.push(position);
         self.health.push(stats.health);
         self.shield.push(stats.shield);
@@ -360,7 +373,7 @@ impl World {
 
     /// Distance from edge to edge; negative where discs overlap.
     fn edge(&self, a: usize, b: usize) -> f64 {
-        distance(self.positions[a], self.positions[b]) - self.stats[a].radius - self.stats[b].radius
+        distance(self.positions[a], self.positions[b]) - self.radii[a] - self.radii[b]
     }
 
     /// How near a unit must come to its target, from edge to edge.

@@ -126,7 +126,7 @@ impl World {
             } else {
                 -1.0
             });
-            let sine = ((self.stats[unit].separation + self.stats[body].separation) / far).min(1.0);
+            let sine = ((self.separations[unit] + self.separations[body]) / far).min(1.0);
             let cosine = (1.0 - sine * sine).sqrt();
             direction = [
                 towards[0] * cosine - side * towards[1] * sine,
@@ -151,7 +151,7 @@ impl World {
                 continue;
             }
             let to = [self.positions[other][0] - from[0], self.positions[other][1] - from[1]];
-            let touch = self.stats[unit].separation + self.stats[other].separation;
+            let touch = self.separations[unit] + self.separations[other];
             let ahead = to[0] * direction[0] + to[1] * direction[1];
             let aside = to[0] * direction[1] - to[1] * direction[0];
             if ahead <= 0.0 || aside.abs() >= touch - TANGENT {
@@ -168,6 +168,9 @@ impl World {
     }
 
     fn push_bodies(&mut self) {
+        if !self.crowded && !self.moving.contains(&true) {
+            return;
+        }
         for _ in 0..PUSHES {
             let mut pushed = false;
             for a in 0..self.len() {
@@ -180,6 +183,7 @@ impl World {
                     }
                 }
             }
+            self.crowded = pushed;
             if !pushed {
                 return;
             }
@@ -188,7 +192,7 @@ impl World {
 
     /// Pushes two overlapping bodies apart; returns whether they overlapped.
     fn push_apart(&mut self, a: usize, b: usize) -> bool {
-        let touch = self.stats[a].separation + self.stats[b].separation;
+        let touch = self.separations[a] + self.separations[b];
         let ([ax, ay], [bx, by]) = (self.positions[a], self.positions[b]);
         let (x, y) = (bx - ax, by - ay);
         let squared = x * x + y * y;

@@ -1,6 +1,6 @@
 //! The scripted opponent: units under an attack-move order fight what comes near their way.
 
-use super::{Layer, Order, Point, ScriptedMedivac, World, distance};
+use super::{Order, Point, ScriptedMedivac, World, distance};
 use crate::combat::unit::{HEALING_ENERGY_MIN, HEALING_SCAN_RANGE, UnitType};
 
 /// How near an opponent must come to be noticed, from edge to edge, where the weapon does not reach farther.
@@ -98,7 +98,6 @@ impl World {
 
     /// Whether two units push each other.
     pub(super) fn share_a_layer(&self, a: usize, b: usize) -> bool {
-        let layer = |unit: usize| -> Layer { self.stats[unit].layer };
-        layer(a) == layer(b)
+        self.layers[a] == self.layers[b]
     }
 }
