@@ -46,6 +46,7 @@ const EXPERIMENT: &str = "
     algorithm = { buffer_size = 4, batch_size = 2, n_rollout_threads = 2 }
     learner.threads = 1
     evaluation.episodes = 1
+    checkpoints.last_retry_ms = 0
     [network]
     hidden_dim = 2
     attention_dim = 2
