@@ -187,6 +187,6 @@ fn watching_and_following_end_when_nobody_reads_them() {
         assert_eq!(refused.status.code(), Some(1), "{arguments:?}");
     }
     assert!(run.ctl(&["stop"]).status.success());
-    run.finish();
+    run.finish_stopped();
     assert!(output(&["ctl", "--run", root, "status"]).status.success());
 }

@@ -153,8 +153,8 @@ fn what_cannot_be_drawn_is_refused_and_leaves_nothing() {
     };
     render("a.jpeg", &CHASE, &["a.jpeg", ".gif, .png or .svg"]);
     render("nowhere/a.gif", &CHASE, &["nowhere/a.gif", "No such file or directory"]);
-    let task = ["--policy", "script:chase", "--experiment", "predator-prey", "--task", "predator-prey-3-3"];
-    render("a.gif", &task, &["unknown task \"predator-prey-3-3\"", "predator-prey-3-1, predator-prey-3-2"]);
+    let task = ["--policy", "script:chase", "--experiment", "predator-prey", "--task", "predator-prey-0-3"];
+    render("a.gif", &task, &["predator-prey-0-3", "predators must be 1 to 64"]);
     let game = ["--policy", "script:random", "--experiment", "matrix-game", "--task", "game-1"];
     render("a.gif", &game, &["game-1", "there is nothing to draw"]);
     render("a.gif", &["--task", "game-1"], &["give --run DIR", "--policy script:NAME"]);

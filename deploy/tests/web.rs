@@ -237,7 +237,7 @@ fn what_is_asked_is_answered_and_nonsense_is_refused() {
 
     assert_eq!(server.post("/api/resume", &Value::Null).json()["state"], "running");
     assert_eq!(server.post("/api/stop", &Value::Null).json()["state"], "stopping");
-    assert!(train.finish()["env_steps"].as_u64() < Some(50_000));
+    assert!(train.finish_stopped()["env_steps"].as_u64() < Some(50_000));
 }
 
 #[test]

@@ -1,8 +1,8 @@
 //! Proximal policy optimisation over batches that the present weights rolled: MAPPO and MAT under training.
 //!
 //! An update has two parts. Once per batch the networks say what they thought when they acted, and advantages, value
-//! targets and the value normaliser follow ([`targets`]). Then come `epochs` × `minibatches` optimiser steps
-//! on the clipped losses ([`loss`]). Between batches nothing is kept but weights, moments and the normaliser.
+//! targets and the value normaliser follow (`on_policy/targets.rs`). Then come `epochs` × `minibatches` optimiser steps
+//! on the clipped losses (`on_policy/loss.rs`). Between batches nothing is kept but weights, moments and the normaliser.
 
 mod learner;
 mod loss;

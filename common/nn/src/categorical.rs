@@ -41,7 +41,7 @@ vectorized! {
 vectorized! {
     /// The loss's gradient by the logits (rows, A), written: that by each row's log π of the action taken,
     /// `d_log_prob`, and that by its entropy H, `d_entropy`, together.
-    /// d log π(a) / d logit = 1[a] − π; d H / d logit = −π (log π + H).
+    /// d log π(a) / d logit = 1(a) − π; d H / d logit = −π (log π + H).
     pub fn distribution_backward<'a>(
         probabilities: View<'a>,
         log_probabilities: View<'a>,

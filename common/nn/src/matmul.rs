@@ -3,7 +3,7 @@
 //!
 //! A product's row depends on that row's input alone, not on how many rows are multiplied beside it: the
 //! same state must get the same utilities whichever other environments an actor steps at the same time. faer
-//! gives this from [`least_rows`] rows on; fewer get rows of zeros beside them.
+//! gives this from `least_rows` rows on; fewer get rows of zeros beside them.
 
 use crate::{View, ViewMut};
 use faer::{Par, linalg::matmul::matmul, mat};
