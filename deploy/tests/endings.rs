@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{RunFolder, Train, actor_pid, kill, learner_pid, output, rit};
+use common::{RunFolder, Train, actor_pid, kill, learner_pid, output, rit, wait_until_gone};
 use rustix::process::Signal;
 use serde_json::Value;
 use std::{fs, process::Stdio};
@@ -63,6 +63,17 @@ fn a_run_that_was_asked_to_end_says_by_whom() {
     let status = output(&["ctl", "--run", folder.run_dir().to_str().unwrap(), "status"]);
     let status = String::from_utf8(status.stdout).unwrap();
     assert!(status.starts_with("the run is over: interrupted"), "{status}");
+}
+
+/// Waiting for room on a disk is of no use where the directory itself was removed.
+#[test]
+fn a_learner_whose_run_was_removed_ends_with_its_supervisor() {
+    let folder = RunFolder::new();
+    let mut train = under_way(&folder, &[]);
+    let learner = learner_pid(&train.wait_for("the learner", |_| true));
+    fs::remove_dir_all(folder.run_dir()).unwrap();
+    train.signal(Signal::KILL);
+    wait_until_gone(learner);
 }
 
 #[test]

@@ -538,7 +538,8 @@ impl Trainer {
                 Err(error) => error,
             };
             let limit = Duration::from_millis(self.config.checkpoints.last_retry_ms);
-            if begun.elapsed() >= limit {
+            // A directory that was removed does not come back, as room on a disk does.
+            if begun.elapsed() >= limit || !self.run_dir.root().is_dir() {
                 return Err(error);
             }
             if !std::mem::replace(&mut refused, true) {
