@@ -3,6 +3,7 @@
 //! [`run`] speaks gRPC on the runtime: leases come in, weights are watched. One thread of its own acts
 //! and sends; it takes other weights only between leases.
 
+mod losses;
 mod rollout;
 mod run;
 mod sink;

@@ -1,6 +1,7 @@
 //! The rollout thread: a lease in, its episodes out.
 
 use crate::{
+    losses::{Losses, LostLeases},
     sink::{EpisodeSink, SinkError},
     weights::{Weights, WeightsError},
 };
@@ -8,43 +9,15 @@ use rit_algo::{Acting, Model};
 use rit_config::Config;
 use rit_env::{
     Split,
-    rollout::{Job, LostEpisode, Rolled, Rollout},
+    rollout::{Job, LOST_ROUNDS_MAX, LostEpisode, Rollout},
 };
-use rit_episode::{
-    Episode,
-    wire::{self, EncodeError, Frame, PayloadLayout, RunId},
-};
-use rit_proto::v1::Lease;
+use rit_episode::wire::{self, EncodeError, Frame, PayloadLayout, RunId};
+use rit_proto::v1::{Done, Lease, Leaving, actor_message::Message};
 use std::sync::{
     Arc,
     atomic::{AtomicBool, Ordering},
 };
 use tokio::{runtime::Handle, sync::mpsc};
-
-/// An actor that loses so many episodes in a row ends: its environments do not work.
-const FAILURES_MAX: usize = 5;
-
-/// Episodes lost since the last that was not.
-#[derive(Debug, Default)]
-pub(crate) struct Failures(usize);
-
-impl Failures {
-    /// The episode, if there is one. A lost one is logged and left out: the learner misses it when the lease is done,
-    /// and hands its number out again.
-    fn note(&mut self, rolled: Rolled) -> Result<Option<Episode>, RolloutError> {
-        match rolled {
-            Ok(episode) => {
-                self.0 = 0;
-                Ok(Some(episode))
-            }
-            Err(lost) => {
-                self.0 += 1;
-                tracing::warn!(%lost, reason = lost.error.kind.name(), "an episode is lost");
-                if self.0 >= FAILURES_MAX { Err(RolloutError::Environment(lost)) } else { Ok(None) }
-            }
-        }
-    }
-}
 
 /// Why rolling ended.
 #[derive(Debug, thiserror::Error)]
@@ -52,8 +25,8 @@ pub enum RolloutError {
     /// The weights a lease asks for cannot be had.
     #[error(transparent)]
     Weights(#[from] WeightsError),
-    /// Environments that fail again and again.
-    #[error("{FAILURES_MAX} episodes in a row were lost, the last: {0}")]
+    /// Environments that fail again and again. The learner was told of it.
+    #[error("{LOST_ROUNDS_MAX} times in a row every episode was lost, the last: {0}")]
     Environment(LostEpisode),
     /// An episode that does not fit the run's dims.
     #[error(transparent)]
@@ -72,7 +45,7 @@ pub(crate) struct Roller {
     pub(crate) run_id: RunId,
     pub(crate) actor: u32,
     pub(crate) weights: Weights,
-    pub(crate) failures: Failures,
+    pub(crate) lost_leases: LostLeases,
     /// Set when the actor shall end: a blocked send is given up.
     pub(crate) stop: Arc<AtomicBool>,
 }
@@ -81,19 +54,18 @@ impl Roller {
     /// A rollout of the run's training tasks.
     pub(crate) fn rollout(config: &Config) -> Rollout {
         let tasks = config.tasks(Split::Training);
-        let options = config.environment_options();
         let algorithm = &config.algorithm;
-        Rollout::new(tasks, options, config.seed, algorithm.random_permutation)
+        Rollout::new(tasks, rit_worlds::factory(config), config.seed, algorithm.random_permutation)
             .with_exploration_persistence(algorithm.exploration_persistence)
             .with_time_limit_bootstraps(algorithm.time_limit_bootstraps)
     }
 
-    /// Rolls leases until there are no more; says which are `done`.
+    /// Rolls leases until there are no more; says to the learner which are done.
     pub(crate) fn run(
         mut self,
         runtime: &Handle,
         mut leases: mpsc::Receiver<Lease>,
-        done: &mpsc::Sender<u64>,
+        to_learner: &mpsc::Sender<Message>,
     ) -> Result<(), RolloutError> {
         let mut frame = Frame::new(&self.layout);
         let stop = Arc::clone(&self.stop);
@@ -117,13 +89,27 @@ impl Roller {
             let choice = self.model.method().exploring(lease.epsilon);
             let job = |&number| Job { number, weights_version: version, choice, task: None };
             let jobs: Vec<Job> = lease.episodes.iter().map(job).collect();
+            let (mut losses, mut brought_any) = (Losses::default(), false);
             for rolled in self.rollout.roll(acting, &jobs) {
-                let Some(episode) = self.failures.note(rolled)? else { continue };
-                wire::encode(&episode, &self.layout, self.run_id, self.actor, &mut frame)?;
-                self.sink.send(&frame, &give_up)?;
+                match rolled {
+                    Ok(episode) => {
+                        wire::encode(&episode, &self.layout, self.run_id, self.actor, &mut frame)?;
+                        self.sink.send(&frame, &give_up)?;
+                        brought_any = true;
+                    }
+                    Err(lost) => losses.note(lost),
+                }
             }
             self.sink.flush(&give_up)?;
-            if done.blocking_send(lease.lease).is_err() {
+            let done = Message::Done(Done { lease: lease.lease, losses: losses.to_messages() });
+            if let Some(lost) = self.lost_leases.note(losses, brought_any) {
+                // In this order, so that no other lease comes.
+                for last in [Message::Leaving(Leaving {}), done] {
+                    let _ = to_learner.blocking_send(last);
+                }
+                return Err(RolloutError::Environment(lost));
+            }
+            if to_learner.blocking_send(done).is_err() {
                 break;
             }
         }

@@ -1,7 +1,8 @@
 //! An actor process from its beginning to its end.
 
 use crate::{
-    rollout::{Failures, Roller, RolloutError},
+    losses::LostLeases,
+    rollout::{Roller, RolloutError},
     sink::{EpisodeSink, FrameStream},
     weights::Weights,
 };
@@ -12,7 +13,7 @@ use rit_ipc::{EpisodeSender, OpenError, RunSpace, RunSpaceError};
 use rit_proto::{
     transport::{self, Address, AddressError, ConnectError, Credentials, status_words},
     v1::{
-        ActorMessage, Done, Heartbeat, Hello, LearnerMessage, Lease, Leaving, Welcome, actor_message,
+        ActorMessage, Heartbeat, Hello, LearnerMessage, Lease, Leaving, Welcome, actor_message,
         learner_message, rollout_client::RolloutClient,
     },
 };
@@ -41,6 +42,9 @@ const OUTBOX: usize = 16;
 
 /// How long an actor waits for a learner that has gone to come back.
 const RECONNECT_TIMEOUT: Duration = Duration::from_secs(60);
+
+/// How long an actor whose environments fail waits for the learner to have read all it sent.
+const FAREWELL_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// From one look for it to the next.
 const RECONNECT_EVERY: Duration = Duration::from_millis(50);
@@ -253,7 +257,7 @@ impl Actor {
         let layout = PayloadLayout::new(config.dims());
 
         let (leases, lease_queue) = mpsc::channel(1);
-        let (done, lease_done) = mpsc::channel(1);
+        let (to_learner, from_roller) = mpsc::channel(1);
         let stop = Arc::new(AtomicBool::new(false));
         let model = Arc::new(Model::new(config.model())?);
         let acting_bytes = size_of::<f32>() * model.acting().len();
@@ -276,7 +280,7 @@ impl Actor {
             layout,
             run_id: run_id.try_into().map_err(|_| ActorError::RunId)?,
             actor,
-            failures: Failures::default(),
+            lost_leases: LostLeases::default(),
             weights: Weights::watch(client, config.algorithm.policy_lag, acting_bytes)
                 .await
                 .map_err(|status| RolloutError::Weights(status.into()))?,
@@ -287,32 +291,39 @@ impl Actor {
         thread::Builder::new()
             .name("rollout".into())
             .spawn(move || {
-                let _ = result.send(roller.run(&runtime, lease_queue, &done));
+                let _ = result.send(roller.run(&runtime, lease_queue, &to_learner));
             })
             .map_err(ActorError::Thread)?;
         tracing::info!(actor, %address, "joined");
 
-        let conversation = converse(from_learner, outbox, leases, lease_done, leaving);
+        let conversation = converse(from_learner, outbox, leases, from_roller, leaving);
+        tokio::pin!(conversation);
         let ended = tokio::select! {
-            ended = conversation => ended,
+            ended = &mut conversation => ended,
             result = &mut rolled => {
                 let error = result.map_err(|_| ActorError::Panicked)?.err();
+                if let Some(RolloutError::Environment(_)) = error {
+                    // The thread has said what was lost, and that it leaves.
+                    let _ = tokio::time::timeout(FAREWELL_TIMEOUT, conversation).await;
+                }
                 return Err(error.map_or(ActorError::Panicked, Into::into));
             }
         };
         // What is being rolled now is nobody's any more; the thread's place in shared memory must be free again.
         stop.store(true, Ordering::Relaxed);
-        let _ = rolled.await;
-        ended
+        match rolled.await {
+            Ok(Err(error @ RolloutError::Environment(_))) => Err(error.into()),
+            _ => ended,
+        }
     }
 }
 
-/// Passes leases on and says what is done, until farewell.
+/// Passes leases on and says what the rollout thread has to say, until farewell.
 async fn converse(
     mut from_learner: Streaming<LearnerMessage>,
     outbox: mpsc::Sender<ActorMessage>,
     leases: mpsc::Sender<Lease>,
-    mut lease_done: mpsc::Receiver<u64>,
+    mut from_roller: mpsc::Receiver<actor_message::Message>,
     leaving: &mut watch::Receiver<bool>,
 ) -> Result<(), ActorError> {
     let mut heartbeat = tokio::time::interval(HEARTBEAT_EVERY);
@@ -333,7 +344,7 @@ async fn converse(
                 }
                 Err(status) => return Err(gone(&status.message())),
             },
-            Some(lease) = lease_done.recv() => actor_message::Message::Done(Done { lease }),
+            Some(message) = from_roller.recv() => message,
             _ = leaving.wait_for(|leaving| *leaving), if !said => {
                 said = true;
                 actor_message::Message::Leaving(Leaving {})

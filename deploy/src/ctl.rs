@@ -204,6 +204,10 @@ fn status(status: &RunStatus, as_json: bool) -> Result<String, Failure> {
             grouped(ledger.outstanding),
             grouped(rejected)
         ));
+        lines.extend(report::reasons(&ledger.rejected).map(|words| format!("taken back         {words}")));
+        lines.extend(
+            report::reasons(&ledger.frames_refused).map(|words| format!("frames refused     {words}")),
+        );
     }
     lines.push(format!("{:18} process {}", "learner", status.pid));
     for actor in &status.actors {

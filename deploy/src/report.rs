@@ -1,7 +1,10 @@
 //! Results as people read them.
 
 use rit_proto::v1::{MetricsLine, RunState, RunStatus, TaskResult};
-use std::fmt::Write as _;
+use std::{
+    collections::{BTreeMap, HashMap},
+    fmt::Write as _,
+};
 
 /// One line a task: name, mean return, win rate where there is one.
 pub fn table(results: &[TaskResult]) -> String {
@@ -113,6 +116,14 @@ pub fn printable(text: &str) -> String {
     if shown.chars().count() < text.chars().count() { shown + "…" } else { shown }
 }
 
+/// Counts by reason, in a few words; `None` where there are none.
+pub fn reasons(counts: &HashMap<String, u64>) -> Option<String> {
+    let sorted: BTreeMap<_, _> = counts.iter().filter(|(_, count)| **count > 0).collect();
+    let words =
+        sorted.iter().map(|(reason, count)| format!("{} {}", words(&printable(reason)), grouped(**count)));
+    (!sorted.is_empty()).then(|| words.collect::<Vec<_>>().join(", "))
+}
+
 /// A number with thin groups of three digits.
 pub fn grouped(number: u64) -> String {
     let digits = number.to_string();
@@ -147,6 +158,19 @@ mod tests {
             [0.4, 59.6, 61.0, 3700.0].map(duration),
             ["0 s", "1 min 00 s", "1 min 01 s", "1 h 01 min"]
         );
+    }
+
+    #[test]
+    fn reasons_are_said_with_their_counts() {
+        let counts = |counts: &[(&str, u64)]| {
+            reasons(&counts.iter().map(|&(reason, count)| (reason.to_owned(), count)).collect())
+        };
+        let expected = "actor gone 3, environment died 1 200".to_owned();
+        assert_eq!(
+            counts(&[("environment_died", 1200), ("actor_gone", 3), ("actor_hung", 0)]),
+            Some(expected)
+        );
+        assert_eq!(counts(&[]), None);
     }
 
     #[test]

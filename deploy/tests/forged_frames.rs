@@ -6,7 +6,7 @@ mod common;
 use common::RunFolder;
 use rit_config::RunDir;
 use rit_env::{
-    EnvironmentOptions, Script, Split, TaskSet,
+    Embedded, Script, Split, TaskSet,
     rollout::{Job, Rollout},
 };
 use rit_episode::{
@@ -14,7 +14,7 @@ use rit_episode::{
     wire::{self, Frame, PayloadLayout},
 };
 use rit_ipc::{EpisodeSender, RunSpace};
-use std::{fs, path::Path, time::Duration};
+use std::{fs, path::Path, sync::Arc, time::Duration};
 
 #[test]
 fn forged_frames_are_counted_and_never_reach_replay() {
@@ -34,7 +34,7 @@ fn forged_frames_are_counted_and_never_reach_replay() {
     // Not a frame at all; a whole episode that nobody handed out; the same with one bit changed.
     send(&Frame::new(&layout));
     let tasks = TaskSet::MatrixGame.tasks(Split::Training);
-    let mut rollout = Rollout::new(tasks, EnvironmentOptions::default(), RunSeed(9), true);
+    let mut rollout = Rollout::new(tasks, Arc::new(Embedded::default()), RunSeed(9), true);
     let job = Job { number: 1_000_000, weights_version: 0, choice: Choice::EpsilonGreedy(1.0), task: None };
     let episode = rollout.roll(&mut Script::Random, &[job]).remove(0).unwrap();
     let mut frame = Frame::new(&layout);

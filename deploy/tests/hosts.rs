@@ -323,6 +323,10 @@ impl Conversation {
         Ok(Self { to_learner, from_learner })
     }
 
+    async fn say(&self, message: Said) {
+        self.to_learner.send(v1::ActorMessage { message: Some(message) }).await.unwrap();
+    }
+
     async fn hear(&mut self) -> Option<Heard> {
         self.from_learner.message().await.unwrap().map(|message| message.message.unwrap())
     }
@@ -357,6 +361,39 @@ async fn an_actor_that_comes_back_takes_its_place_over() {
     drop((first.to_learner, again.to_learner));
 }
 
+/// Says that all of these episodes were lost.
+fn all_lost(lease: &v1::Lease) -> Said {
+    let (reason, detail) = ("environment_died".to_owned(), "the game has ended".to_owned());
+    let loss = v1::Loss { reason, episodes: lease.episodes.clone(), detail };
+    Said::Done(v1::Done { lease: lease.lease, losses: vec![loss] })
+}
+
+#[tokio::test]
+async fn what_environments_lose_is_counted_by_its_reason_and_handed_out_again() {
+    let folder = RunFolder::new();
+    let (mut train, token) = on_loopback(&folder);
+    let mut actor = Conversation::join(call(&folder, token).await, 7).await.unwrap();
+    let Some(Heard::Welcome(_)) = actor.hear().await else { panic!("no welcome") };
+    let Some(Heard::Lease(lease)) = actor.hear().await else { panic!("no lease") };
+    actor.say(all_lost(&lease)).await;
+    let Some(Heard::Lease(again)) = actor.hear().await else { panic!("no lease") };
+    assert_eq!(again.episodes, lease.episodes);
+    // An actor that gives up says so first, and is given nothing more.
+    actor.say(Said::Leaving(v1::Leaving {})).await;
+    actor.say(all_lost(&again)).await;
+    assert!(matches!(actor.hear().await, Some(Heard::Farewell(_))));
+    let lost = 2 * lease.episodes.len();
+    let status = train.wait_for("losses", |status| status["ledger"]["rejected"]["environment_died"] == lost);
+    balanced(&status);
+    let said = |happening: &&Value| happening["what"].as_str().unwrap().contains("the game has ended");
+    let happenings = status["happenings"].as_array().unwrap();
+    let warnings: Vec<_> = happenings.iter().filter(said).map(|it| &it["warning"]).collect();
+    assert_eq!(warnings, [true, false], "the first is said aloud: {happenings:?}");
+    let shown = output(&["ctl", "--run", folder.run_dir().to_str().unwrap(), "status"]).stdout;
+    let shown = String::from_utf8(shown).unwrap();
+    assert!(shown.contains(&format!("taken back         environment died {lost}")), "{shown}");
+}
+
 #[tokio::test]
 async fn what_comes_twice_or_is_forged_is_counted_and_not_let_in() {
     let folder = RunFolder::new();
@@ -369,7 +406,7 @@ async fn what_comes_twice_or_is_forged_is_counted_and_not_let_in() {
     let config = rit_config::resolve(&welcome.config, "welcome", &[]).unwrap();
     let layout = PayloadLayout::new(TaskSet::MatrixGame.dims());
     let tasks = TaskSet::MatrixGame.tasks(Split::Training);
-    let mut rollout = Rollout::new(tasks, config.environment_options(), config.seed, true);
+    let mut rollout = Rollout::new(tasks, rit_worlds::factory(&config), config.seed, true);
     let job = Job {
         number: lease.episodes[0],
         weights_version: lease.weights_version,

@@ -7,6 +7,7 @@
 
 mod control;
 mod joining;
+mod losses;
 mod messages;
 mod shell;
 mod standstill;
@@ -23,10 +24,15 @@ use crate::{
 };
 use rit_algo::learner::Measure;
 use rit_config::Config;
+use rit_env::FailureKind;
 use rit_episode::Episode;
 use rit_proto::v1;
-use std::{collections::BTreeMap, time::Duration};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    time::Duration,
+};
 
+pub use losses::Loss;
 pub use messages::{Effect, Input, Joining, Refusal};
 pub use shell::{ACTOR_QUEUE, Control, Event, Shell};
 
@@ -108,6 +114,10 @@ pub struct Coordinator {
     /// Whether the last one was not written.
     checkpoints_fail: bool,
     happenings: Happenings,
+    /// Kinds of failures of environments that were said aloud.
+    losses_said: BTreeSet<FailureKind>,
+    /// The last of them since something went on.
+    last_loss: Option<String>,
     /// How often the ledger was found not to balance.
     imbalances: u64,
 }
@@ -136,6 +146,8 @@ impl Coordinator {
             checkpoints: v1::CheckpointsStatus::default(),
             checkpoints_fail: false,
             happenings,
+            losses_said: BTreeSet::new(),
+            last_loss: None,
             imbalances: 0,
             now: Duration::ZERO,
             looked: Duration::ZERO,
@@ -226,8 +238,11 @@ impl Coordinator {
                 *self.frames_refused.entry(reason).or_default() += 1;
             }
             Input::Join(joining) => self.join(joining, effects),
-            Input::Done(actor, lease) => {
+            Input::Done(actor, lease, losses) => {
                 self.heard(actor, effects);
+                if self.has_outstanding(actor, lease) {
+                    self.take_losses(actor, losses, effects);
+                }
                 // Not all of it has come through yet, or a frame was refused: look again once all that was
                 // sent before has been read.
                 if self.has_outstanding(actor, lease) {

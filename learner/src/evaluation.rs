@@ -2,13 +2,13 @@
 
 use rit_config::Config;
 use rit_env::{
-    Environment, EnvironmentOptions, Split, Task, TaskError, TaskSet,
+    Environment, EnvironmentFactory, Split, Task, TaskError, TaskSet,
     rollout::{Job, LostEpisode, Rollout, all_rolled},
 };
 use rit_episode::{Choice, Episode, Policy, RunSeed};
 use rit_proto::v1;
 use serde::{Deserialize, Serialize};
-use std::{collections::BTreeMap, ops::Range};
+use std::{collections::BTreeMap, ops::Range, sync::Arc};
 
 /// Episodes rolled side by side.
 const SIDE_BY_SIDE: usize = 32;
@@ -84,24 +84,29 @@ pub enum TasksError {
 }
 
 /// What all evaluations of a run share.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 pub struct Evaluator {
     task_set: TaskSet,
     /// Training tasks and testing tasks.
     tasks: [Vec<Task>; 2],
-    options: EnvironmentOptions,
+    factory: Arc<dyn EnvironmentFactory>,
     random_permutation: bool,
     episodes: usize,
     testing_episodes: usize,
 }
 
 impl Evaluator {
-    /// Of a run's configuration.
+    /// Of a run's configuration, with worlds of their own.
     pub fn new(config: &Config) -> Self {
+        Self::with_factory(config, rit_worlds::factory(config))
+    }
+
+    /// Of a run's configuration, with worlds of this factory.
+    pub fn with_factory(config: &Config, factory: Arc<dyn EnvironmentFactory>) -> Self {
         Self {
             task_set: config.environment.task_set,
             tasks: [Split::Training, Split::Testing].map(|split| config.tasks(split)),
-            options: config.environment_options(),
+            factory,
             random_permutation: config.algorithm.random_permutation,
             episodes: config.evaluation.episodes,
             testing_episodes: config.evaluation.testing_episodes,
@@ -145,10 +150,11 @@ impl Evaluator {
         Ok(tasks)
     }
 
-    /// Rolls greedy episodes of each task, so many of each as are asked for or as the run has of its own.
+    /// Rolls greedy episodes of each task, so many of each as are asked for or as the run has of its own. Those that are
+    /// lost are rolled again.
     ///
     /// # Errors
-    /// When an environment cannot go on.
+    /// When environments fail again and again.
     pub fn evaluate_own(
         &self,
         policy: &mut dyn Policy,
@@ -163,7 +169,7 @@ impl Evaluator {
     /// Rolls so many greedy episodes of each task. The same seed rolls the same episodes.
     ///
     /// # Errors
-    /// When an environment cannot go on.
+    /// When environments fail again and again.
     pub fn evaluate(
         &self,
         policy: &mut dyn Policy,
@@ -177,7 +183,7 @@ impl Evaluator {
     /// [`Self::evaluate_own`], given up within a few episodes once nobody wants it any more: then `None`.
     ///
     /// # Errors
-    /// When an environment cannot go on.
+    /// When environments fail again and again.
     pub fn evaluate_unless(
         &self,
         policy: &mut dyn Policy,
@@ -215,7 +221,7 @@ impl Evaluator {
 
     fn rollout(&self, task: Task, seed: RunSeed) -> Rollout {
         let seed = seed.derive(&task.to_string(), 0);
-        Rollout::new(vec![task], self.options, seed, self.random_permutation)
+        Rollout::new(vec![task], Arc::clone(&self.factory), seed, self.random_permutation)
     }
 
     fn evaluate_task(
@@ -228,12 +234,13 @@ impl Evaluator {
     ) -> Result<Option<TaskResult>, LostEpisode> {
         let mut rollout = self.rollout(task, seed);
         let (mut total, mut won) = (0.0, 0);
-        for begin in (0..episodes as u64).step_by(SIDE_BY_SIDE) {
+        let side_by_side = SIDE_BY_SIDE.min(self.factory.worlds_max()).max(1);
+        for begin in (0..episodes as u64).step_by(side_by_side) {
             if given_up() {
                 return Ok(None);
             }
-            let numbers = begin..(begin + SIDE_BY_SIDE as u64).min(episodes as u64);
-            for episode in all_rolled(rollout.roll(policy, &jobs(numbers)))? {
+            let numbers = begin..(begin + side_by_side as u64).min(episodes as u64);
+            for episode in rollout.roll_all(policy, &jobs(numbers))? {
                 total += episode.total_reward();
                 won += usize::from(episode.won);
             }
@@ -243,7 +250,7 @@ impl Evaluator {
             task: task.to_string(),
             episodes: episodes as u64,
             mean_return: share(total),
-            win_rate: task.spec().has_wins.then(|| share(won as f64)),
+            win_rate: self.factory.spec(task).has_wins.then(|| share(won as f64)),
             exploring: None,
         }))
     }

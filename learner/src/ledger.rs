@@ -7,6 +7,7 @@
 //!
 //! Nothing here waits, sends or draws: it is the bookkeeping alone.
 
+use rit_env::FailureKind;
 use rit_episode::Episode;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -41,6 +42,8 @@ pub enum Reason {
     ActorHung,
     /// The actor says it has sent it, and it is not there: its frame was refused.
     NotArrived,
+    /// Its environment could not go on.
+    Environment(FailureKind),
     /// The run ended first.
     RunEnded,
 }
@@ -52,6 +55,7 @@ impl Reason {
             Self::ActorGone => "actor_gone",
             Self::ActorHung => "actor_hung",
             Self::NotArrived => "not_arrived",
+            Self::Environment(kind) => kind.name(),
             Self::RunEnded => "run_ended",
         }
     }
@@ -196,14 +200,23 @@ impl Ledger {
     /// Takes back what an actor still has, to be handed out again. Returns how many episodes that were.
     pub fn take_back(&mut self, actor: ActorId, reason: Reason) -> usize {
         let numbers: Vec<u64> = self.outstanding_with(actor).collect();
-        for number in &numbers {
-            self.outstanding.remove(number);
-            self.returned.insert(*number);
+        self.take_back_some(actor, &numbers, reason)
+    }
+
+    /// Takes these back, as far as the actor still has them. Returns how many episodes that were.
+    pub fn take_back_some(&mut self, actor: ActorId, numbers: &[u64], reason: Reason) -> usize {
+        let mut count = 0;
+        for number in numbers {
+            if self.outstanding.get(number) == Some(&actor) {
+                self.outstanding.remove(number);
+                self.returned.insert(*number);
+                count += 1;
+            }
         }
-        if !numbers.is_empty() {
-            *self.rejected.entry(reason).or_default() += numbers.len() as u64;
+        if count > 0 {
+            *self.rejected.entry(reason).or_default() += count as u64;
         }
-        numbers.len()
+        count
     }
 
     /// The numbers an actor has.
@@ -291,6 +304,22 @@ mod tests {
         assert!(counts.balance());
         assert_eq!((counts.handed_out, counts.inserted, counts.outstanding), (6, 2, 2));
         assert_eq!(counts.rejected, BTreeMap::from([(Reason::ActorGone, 2)]));
+    }
+
+    #[test]
+    fn what_an_environment_lost_is_handed_out_again_under_its_reason() {
+        let mut ledger = Ledger::new(4, 0, vec![terms(7)]);
+        ledger.lease(1, 3);
+        ledger.lease(2, 1);
+        let reason = Reason::Environment(FailureKind::Died);
+        // Another actor's, and one that nobody has, stay where they are.
+        assert_eq!(ledger.take_back_some(1, &[0, 2, 2, 3, 9], reason), 2);
+        assert_eq!(ledger.lease(1, 9).unwrap().episodes, [0, 2]);
+        let counts = ledger.counts();
+        assert!(counts.balance());
+        assert_eq!((counts.handed_out, counts.outstanding), (6, 4));
+        assert_eq!(counts.rejected, BTreeMap::from([(reason, 2)]));
+        assert_eq!(reason.name(), "environment_died");
     }
 
     #[test]

@@ -269,10 +269,11 @@ fn files(folder: &Path) -> io::Result<Vec<u64>> {
 mod tests {
     use super::*;
     use rit_env::{
-        EnvironmentOptions, Script, Split, TaskSet,
+        Embedded, Script, Split, TaskSet,
         rollout::{Job, Rollout, all_rolled},
     };
     use rit_episode::{Choice, RunSeed};
+    use std::sync::Arc;
 
     const RUN: RunId = *b"a run's sixteen.";
 
@@ -287,7 +288,7 @@ mod tests {
 
     fn episodes(numbers: Range<u64>) -> Vec<Episode> {
         let tasks = TaskSet::MatrixGame.tasks(Split::Training);
-        let mut rollout = Rollout::new(tasks, EnvironmentOptions::default(), RunSeed(3), true);
+        let mut rollout = Rollout::new(tasks, Arc::new(Embedded::default()), RunSeed(3), true);
         let jobs: Vec<Job> = numbers
             .map(|number| Job { number, weights_version: 7, choice: Choice::EpsilonGreedy(1.0), task: None })
             .collect();

@@ -1,7 +1,8 @@
 //! `rit.v1.Rollout`: turns an actor's stream into events.
 
-use crate::coordinator::{ACTOR_QUEUE, Event};
-use rit_proto::v1::{ActorMessage, LearnerMessage, actor_message::Message, rollout_server};
+use crate::coordinator::{ACTOR_QUEUE, Event, Loss};
+use rit_env::FailureKind;
+use rit_proto::v1::{self, ActorMessage, LearnerMessage, actor_message::Message, rollout_server};
 use std::pin::Pin;
 use tokio::sync::{mpsc, oneshot};
 use tokio_stream::{Stream, wrappers::ReceiverStream};
@@ -24,6 +25,18 @@ fn check_name(name: &str) -> Result<(), Status> {
     Err(Status::invalid_argument(format!(
         "{begin:?} is no name for an actor; use up to {NAME_BYTES_MAX} letters, digits, '-', '_' and '.'"
     )))
+}
+
+/// What an actor says of a failure is shown to people: in characters at most.
+const DETAIL_CHARS_MAX: usize = 1000;
+
+/// What was lost, for the reasons that there are: episodes of others are missed when all that was sent has been read.
+fn losses(losses: Vec<v1::Loss>) -> Vec<Loss> {
+    let loss = |v1::Loss { reason, episodes, detail }| {
+        let kind = FailureKind::ALL.into_iter().find(|kind| kind.name() == reason)?;
+        Some(Loss { kind, episodes, detail: detail.chars().take(DETAIL_CHARS_MAX).collect() })
+    };
+    losses.into_iter().filter_map(loss).collect()
 }
 
 #[tonic::async_trait]
@@ -50,7 +63,7 @@ impl rollout_server::Rollout for RolloutService {
             // A message, the end, or an error: what is no message ends the actor's time here.
             while let Ok(Some(message)) = messages.message().await {
                 let event = match message.message {
-                    Some(Message::Done(done)) => Event::Done(actor, done.lease),
+                    Some(Message::Done(done)) => Event::Done(actor, done.lease, losses(done.losses)),
                     Some(Message::Leaving(_)) => Event::Leaving(actor),
                     Some(Message::Heartbeat(_)) => Event::Heartbeat(actor),
                     Some(Message::Hello(_)) | None => continue,

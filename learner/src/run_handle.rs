@@ -8,7 +8,7 @@ use crate::{
 };
 use rit_algo::{Acting, Model, learner::Measure};
 use rit_config::{Config, ConfigError, RunDir, RunDirError, set, set_live};
-use rit_env::{Scene, TaskError, rollout::LostEpisode};
+use rit_env::{EnvironmentFactory, Scene, TaskError, rollout::LostEpisode};
 use rit_episode::{Episode, RunSeed};
 use rit_proto::v1;
 use std::sync::{
@@ -90,6 +90,8 @@ pub struct RunHandle {
     set_log: SetLog,
     model: Arc<Model>,
     measures: &'static [Measure],
+    /// Worlds for whoever asks.
+    factory: Arc<dyn EnvironmentFactory>,
     /// One caller's episodes at a time: training goes on beside them.
     rollouts: Arc<Semaphore>,
     /// Room for those who wait for their turn.
@@ -116,8 +118,8 @@ impl RunHandle {
         measures: &'static [Measure],
         set_log: SetLog,
     ) -> Self {
+        let (setting, factory) = (Arc::default(), rit_worlds::factory(&config));
         let config = watch::Sender::new(Arc::new(config));
-        let setting = Arc::default();
         Self {
             events,
             board,
@@ -127,6 +129,7 @@ impl RunHandle {
             set_log,
             model,
             measures,
+            factory,
             rollouts: Arc::new(Semaphore::new(1)),
             waiting: Arc::new(Semaphore::new(WAITING_MAX)),
         }
@@ -196,7 +199,7 @@ impl RunHandle {
     pub async fn evaluate(&self, request: v1::EvaluateRequest) -> Result<v1::Evaluation, AskError> {
         let v1::EvaluateRequest { tasks, episodes, seed } = request;
         let config = self.config();
-        let evaluator = Evaluator::new(&config);
+        let evaluator = Evaluator::with_factory(&config, Arc::clone(&self.factory));
         let tasks = evaluator.tasks(&tasks)?;
         let episodes = match episodes {
             0 => None,
@@ -222,7 +225,7 @@ impl RunHandle {
     /// When there is no such task.
     pub async fn watch(&self, task: &str, number: u64) -> Result<Watched, AskError> {
         let config = self.config();
-        let evaluator = Evaluator::new(&config);
+        let evaluator = Evaluator::with_factory(&config, Arc::clone(&self.factory));
         let task = config.environment.task_set.task(task)?;
         let seed = evaluation_seed(&config);
         self.roll(move |acting, snapshot, _| {

@@ -145,14 +145,14 @@ mod tests {
     use super::*;
     use crate::checkpoint::{Manifest, Progress};
     use rit_env::{
-        EnvironmentOptions, Script, Split, TaskSet,
+        Embedded, Script, Split, TaskSet,
         rollout::{Job, Rollout},
     };
     use rit_episode::{Choice, RunSeed};
 
     fn episode() -> Arc<Episode> {
         let tasks = TaskSet::MatrixGame.tasks(Split::Training);
-        let mut rollout = Rollout::new(tasks, EnvironmentOptions::default(), RunSeed(3), true);
+        let mut rollout = Rollout::new(tasks, Arc::new(Embedded::default()), RunSeed(3), true);
         let job = Job { number: 0, weights_version: 0, choice: Choice::EpsilonGreedy(1.0), task: None };
         Arc::new(rollout.roll(&mut Script::Random, &[job]).swap_remove(0).unwrap())
     }

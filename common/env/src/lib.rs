@@ -2,6 +2,7 @@
 //! network, no decision order and no transport.
 //!
 //! - [`Environment`]: what one task's world does; [`conformance`] is the suite every one of them passes.
+//! - [`EnvironmentFactory`]: where worlds come from; [`Embedded`] makes those of this crate.
 //! - [`TaskSet`]: which tasks belong together; which are for training, which for testing.
 //! - [`Seated`]: an environment seen in decision order.
 //! - [`rollout`]: rolls numbered episodes with a [`rit_episode::Policy`], several at once.
@@ -9,6 +10,7 @@
 pub mod combat;
 pub mod conformance;
 mod environment;
+mod factory;
 pub mod matrix_game;
 pub mod particle;
 pub mod rollout;
@@ -21,6 +23,7 @@ pub use environment::{
     BodyKind, Environment, EnvironmentError, EnvironmentOptions, FailureKind, LinkKind, Scene, SceneBody,
     SceneLink, SceneUnit, Spec, Step,
 };
+pub use factory::{Embedded, EnvironmentFactory};
 pub use scripts::{Script, UnfitScript};
 pub use seated::Seated;
 pub use task_set::{Split, Task, TaskError, TaskSet};

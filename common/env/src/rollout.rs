@@ -1,11 +1,12 @@
 //! The rollout loop: numbered episodes in, finished episodes out. Actors and evaluation share it.
 
-use crate::{Environment, EnvironmentError, EnvironmentOptions, Seated, Task};
+use crate::{Environment, EnvironmentError, EnvironmentFactory, Seated, Task};
 use rand::RngExt as _;
 use rit_episode::{
     Action, Choice, End, Episode, EpisodeBuilder, Exploration, Observation, Policy, Rng, RunSeed, Stream,
     Turn, decision_order,
 };
+use std::sync::Arc;
 
 /// An episode to be rolled.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -24,7 +25,7 @@ pub struct Job {
 /// and the policy alone, not on the jobs beside it.
 pub struct Rollout {
     tasks: Vec<Task>,
-    options: EnvironmentOptions,
+    factory: Arc<dyn EnvironmentFactory>,
     seed: RunSeed,
     random_permutation: bool,
     exploration_persistence: f32,
@@ -77,14 +78,14 @@ struct Running {
 }
 
 impl Rollout {
-    /// Rolls episodes of these tasks, played with these options, with streams of this seed; with `random_permutation` each episode's
-    /// decision order is a fresh uniform permutation.
+    /// Rolls episodes of these tasks in worlds of this factory, with streams of this seed; with `random_permutation`
+    /// each episode's decision order is a fresh uniform permutation.
     ///
     /// # Panics
     /// Without tasks.
     pub fn new(
         tasks: Vec<Task>,
-        options: EnvironmentOptions,
+        factory: Arc<dyn EnvironmentFactory>,
         seed: RunSeed,
         random_permutation: bool,
     ) -> Self {
@@ -92,7 +93,7 @@ impl Rollout {
         let idle = tasks.iter().map(|_| Vec::new()).collect();
         Self {
             tasks,
-            options,
+            factory,
             seed,
             random_permutation,
             exploration_persistence: 0.0,
@@ -170,6 +171,35 @@ impl Rollout {
         rolled.into_iter().flatten().collect()
     }
 
+    /// As [`Self::roll`]; jobs whose episodes are lost are rolled again, under their numbers.
+    ///
+    /// # Errors
+    /// The last that was lost when [`LOST_ROUNDS_MAX`] rounds in a row have brought none.
+    pub fn roll_all(&mut self, policy: &mut dyn Policy, jobs: &[Job]) -> Result<Vec<Episode>, LostEpisode> {
+        let mut episodes: Vec<Option<Episode>> = jobs.iter().map(|_| None).collect();
+        let mut left: Vec<usize> = (0..jobs.len()).collect();
+        let mut lost_rounds = 0;
+        while !left.is_empty() {
+            let round: Vec<Job> = left.iter().map(|&at| jobs[at]).collect();
+            let (mut lost_ones, mut last) = (Vec::new(), None);
+            for (&at, rolled) in left.iter().zip(self.roll(policy, &round)) {
+                match rolled {
+                    Ok(episode) => episodes[at] = Some(episode),
+                    Err(lost) => {
+                        lost_ones.push(at);
+                        last = Some(lost);
+                    }
+                }
+            }
+            lost_rounds = if lost_ones.len() < left.len() { 0 } else { lost_rounds + 1 };
+            if let Some(lost) = last.filter(|_| lost_rounds >= LOST_ROUNDS_MAX) {
+                return Err(lost);
+            }
+            left = lost_ones;
+        }
+        Ok(episodes.into_iter().flatten().collect())
+    }
+
     fn lost(&self, number: u64, task: usize, error: EnvironmentError) -> LostEpisode {
         LostEpisode { number, task: self.tasks[task].to_string(), error }
     }
@@ -179,8 +209,11 @@ impl Rollout {
         let task = job.task.unwrap_or_else(|| stream(Stream::Task).random_range(0..self.tasks.len()));
         let mut environment_rng = stream(Stream::Environment);
         let mut order_rng = stream(Stream::DecisionOrder);
-        let mut world =
-            self.idle[task].pop().unwrap_or_else(|| Seated::new(self.tasks[task].environment(self.options)));
+        let world = match self.idle[task].pop() {
+            Some(world) => Ok(world),
+            None => self.factory.build(self.tasks[task]).map(Seated::new),
+        };
+        let mut world = world.map_err(|error| (slot, self.lost(job.number, task, error)))?;
         let n_agents = world.spec().n_agents;
         let order = if self.random_permutation {
             decision_order::draw(n_agents, &mut order_rng)
@@ -247,6 +280,9 @@ impl Running {
     }
 }
 
+/// Rounds in a row that may bring no episode at all; then the environments do not work.
+pub const LOST_ROUNDS_MAX: usize = 3;
+
 /// The episodes of jobs none of which was lost.
 ///
 /// # Errors
@@ -258,8 +294,10 @@ pub fn all_rolled(rolled: Vec<Rolled>) -> Result<Vec<Episode>, LostEpisode> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Script, Split, TaskSet};
+    use crate::{Embedded, EnvironmentOptions, FailureKind, Script, Spec, Split, Step, TaskSet};
+    use crate::{Environment, matrix_game::MatrixGame};
     use rit_episode::decision_order::is_permutation;
+    use std::sync::atomic::{AtomicUsize, Ordering};
 
     /// Plays a fixed action by row.
     struct Fixed([Action; 2]);
@@ -277,7 +315,7 @@ mod tests {
     fn rollout(seed: u64, random_permutation: bool) -> Rollout {
         Rollout::new(
             TaskSet::MatrixGame.tasks(Split::Training),
-            EnvironmentOptions::default(),
+            Arc::new(Embedded::default()),
             RunSeed(seed),
             random_permutation,
         )
@@ -336,7 +374,7 @@ mod tests {
     fn whoever_watches_sees_every_state_of_the_same_episodes() {
         let set = TaskSet::PredatorPrey;
         let new =
-            || Rollout::new(set.tasks(Split::Training), EnvironmentOptions::default(), RunSeed(2), true);
+            || Rollout::new(set.tasks(Split::Training), Arc::new(Embedded::default()), RunSeed(2), true);
         let jobs = jobs(0..5);
         let mut seen = vec![Vec::new(); jobs.len()];
         let watched = new().roll_watched(&mut Script::Random, &jobs, |job, world| {
@@ -356,12 +394,91 @@ mod tests {
         }
     }
 
+    /// A matrix game in which a step of every so many, over all worlds, fails.
+    struct Brittle {
+        game: MatrixGame,
+        steps: Arc<AtomicUsize>,
+        fails_every: usize,
+    }
+
+    impl Environment for Brittle {
+        fn spec(&self) -> Spec {
+            MatrixGame::SPEC
+        }
+
+        fn reset(&mut self, rng: &mut Rng) -> Result<(), EnvironmentError> {
+            self.game.reset(rng)
+        }
+
+        fn observe(&self, observation: &mut Observation) {
+            self.game.observe(observation);
+        }
+
+        fn step(&mut self, actions: &[Action], rng: &mut Rng) -> Result<Step, EnvironmentError> {
+            if self.steps.fetch_add(1, Ordering::Relaxed) % self.fails_every == self.fails_every - 1 {
+                return Err(EnvironmentError { kind: FailureKind::Died, detail: "it broke".into() });
+            }
+            self.game.step(actions, rng)
+        }
+    }
+
+    /// Makes them, and counts how many it has made.
+    struct BrittleWorlds {
+        steps: Arc<AtomicUsize>,
+        fails_every: usize,
+        built: AtomicUsize,
+    }
+
+    impl EnvironmentFactory for BrittleWorlds {
+        fn build(&self, task: Task) -> Result<Box<dyn Environment>, EnvironmentError> {
+            self.built.fetch_add(1, Ordering::Relaxed);
+            let Task::MatrixGame { game } = task else { panic!("{task} is no matrix game") };
+            let (steps, fails_every) = (Arc::clone(&self.steps), self.fails_every);
+            Ok(Box::new(Brittle { game: MatrixGame::new(game), steps, fails_every }))
+        }
+    }
+
+    fn brittle(fails_every: usize) -> (Rollout, Arc<BrittleWorlds>) {
+        let worlds =
+            Arc::new(BrittleWorlds { steps: Arc::default(), fails_every, built: AtomicUsize::default() });
+        let tasks = TaskSet::MatrixGame.tasks(Split::Training);
+        (Rollout::new(tasks, Arc::<BrittleWorlds>::clone(&worlds), RunSeed(3), true), worlds)
+    }
+
+    #[test]
+    fn a_world_that_fails_costs_its_episode_and_is_built_anew() {
+        let (mut rollout, worlds) = brittle(3);
+        let jobs: Vec<Job> =
+            (0..1).map(|number| Job { task: Some(0), ..jobs(number..number + 1)[0] }).collect();
+        // Two steps an episode: the first step of the second episode is the third of all.
+        assert!(rollout.roll(&mut Fixed([0, 2]), &jobs)[0].is_ok());
+        let lost = rollout.roll(&mut Fixed([0, 2]), &jobs).remove(0).unwrap_err();
+        assert_eq!(
+            (lost.to_string().as_str(), lost.error.kind),
+            ("episode 0 of game-1: it broke", FailureKind::Died)
+        );
+        assert_eq!(worlds.built.load(Ordering::Relaxed), 1);
+        assert!(rollout.roll(&mut Fixed([0, 2]), &jobs)[0].is_ok());
+        assert_eq!(worlds.built.load(Ordering::Relaxed), 2);
+    }
+
+    #[test]
+    fn what_is_lost_is_rolled_again_to_the_same_episode() {
+        let jobs = jobs(0..20);
+        let expected = all_rolled(rollout(3, true).roll(&mut Fixed([0, 2]), &jobs)).unwrap();
+        assert_eq!(brittle(7).0.roll_all(&mut Fixed([0, 2]), &jobs).as_ref(), Ok(&expected));
+        let (mut broken, worlds) = brittle(1);
+        let lost = broken.roll_all(&mut Fixed([0, 2]), &jobs).unwrap_err();
+        assert_eq!((lost.number, lost.error.detail.as_str()), (19, "it broke"));
+        assert_eq!(worlds.built.load(Ordering::Relaxed), 20 * LOST_ROUNDS_MAX);
+    }
+
     #[test]
     fn options_reach_the_environments() {
         for (view_radius, sees_others) in [(None, true), (Some(0.0), false)] {
             let tasks = TaskSet::CooperativeNavigation.tasks(Split::Training);
             let options = EnvironmentOptions { view_radius, ..EnvironmentOptions::default() };
-            let rolled = Rollout::new(tasks, options, RunSeed(1), true)
+            let rolled = Rollout::new(tasks, Arc::new(Embedded(options)), RunSeed(1), true)
                 .roll(&mut Fixed([0, 0]), &[Job { task: Some(0), ..jobs(0..1)[0] }]);
             let episodes = all_rolled(rolled).unwrap();
             let rows = episodes[0].observable.chunks_exact(4).enumerate();

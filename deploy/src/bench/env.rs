@@ -15,10 +15,11 @@ pub(super) fn run(config: &Config, duration: Duration) -> Result<Report, Failure
     let tasks = config.tasks(Split::Training);
     let mut report = Report::new();
     let mut rates = Vec::new();
-    for task in &tasks {
-        let mut environment = task.environment(config.environment_options());
+    let factory = rit_worlds::factory(config);
+    for &task in &tasks {
+        let mut environment = factory.build(task).map_err(Failure::runtime)?;
         let rng = &mut RunSeed(1).stream(Stream::Environment, 0);
-        let spec = task.spec();
+        let spec = factory.spec(task);
         let mut observation = Observation::default();
         let mut actions: Vec<Action> = vec![0; spec.n_agents];
         // Cheap and uniform enough: what is measured is the environment.

@@ -168,7 +168,7 @@ fn seconds(clock: ClockId) -> f64 {
 
 /// Episodes of random actions of these tasks.
 fn random_episodes(config: &Config, tasks: &[Task], count: u64) -> Vec<Episode> {
-    let mut rollout = Rollout::new(tasks.to_vec(), config.environment_options(), RunSeed(1), true);
+    let mut rollout = Rollout::new(tasks.to_vec(), rit_worlds::factory(config), RunSeed(1), true);
     let jobs: Vec<Job> = (0..count)
         .map(|number| Job { number, weights_version: 0, choice: Choice::EpsilonGreedy(1.0), task: None })
         .collect();

@@ -40,8 +40,8 @@ pub(super) fn measure(
     duration: Duration,
 ) -> Cost {
     let mut acting = Acting::new(model, &params[model.acting()]);
-    let mut rollout =
-        Rollout::new(tasks, config.environment_options(), config.seed, config.algorithm.random_permutation);
+    let factory = rit_worlds::factory(config);
+    let mut rollout = Rollout::new(tasks, factory, config.seed, config.algorithm.random_permutation);
     let side_by_side = side_by_side(config);
     let choice = model.method().exploring(0.05);
     let mut number = 0;

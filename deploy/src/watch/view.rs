@@ -1,7 +1,7 @@
 //! How a run looks on a terminal.
 
 use super::model::{Curve, Model};
-use crate::report::{duration, grouped, printable, state, time_left, words};
+use crate::report::{duration, grouped, printable, reasons, state, time_left, words};
 use ratatui::{
     Frame,
     layout::{Constraint, Layout, Rect},
@@ -143,11 +143,12 @@ fn actor_table(status: &RunStatus) -> Table<'static> {
 fn ledger_of(status: &RunStatus) -> String {
     let ledger = status.ledger.clone().unwrap_or_default();
     let mut text = format!(
-        "ledger: {} handed out = {} inserted + {} outstanding + {} taken back; frames refused: {}",
+        "ledger: {} handed out = {} inserted + {} outstanding + {} taken back{}; frames refused: {}",
         grouped(ledger.handed_out),
         grouped(ledger.inserted),
         grouped(ledger.outstanding),
         grouped(ledger.rejected.values().sum()),
+        reasons(&ledger.rejected).map_or_else(String::new, |words| format!(" ({words})")),
         grouped(ledger.frames_refused.values().sum())
     );
     if ledger.imbalances > 0 {

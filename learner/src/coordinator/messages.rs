@@ -1,5 +1,6 @@
 //! What the coordinator is told, and what it wants done. Plain data: no channel, clock or connection in it.
 
+use super::losses::Loss;
 use crate::{
     ledger::{ActorId, Terms},
     receive::Fence,
@@ -20,8 +21,8 @@ pub enum Input {
     FrameRefused(&'static str),
     /// An actor wants to join. It is admitted or refused at once.
     Join(Joining),
-    /// An actor has sent all of this lease.
-    Done(ActorId, u64),
+    /// An actor has sent all of this lease, but for what was lost.
+    Done(ActorId, u64, Vec<Loss>),
     /// All that an actor had sent by `Done` has been read.
     Fenced(Fence),
     /// An actor is there.

@@ -1,6 +1,6 @@
 //! Around the coordinator: the clock, the channels, and the ways to answer.
 
-use super::{Coordinator, Effect, Input, Joining, LOOK_EVERY, Refusal};
+use super::{Coordinator, Effect, Input, Joining, LOOK_EVERY, Loss, Refusal};
 use crate::{
     ledger::{ActorId, Terms},
     receive::Fence,
@@ -36,8 +36,8 @@ pub enum Event {
     FrameRefused(&'static str),
     /// An actor wants to join.
     Join(v1::Hello, ToActor, oneshot::Sender<Result<ActorId, Status>>),
-    /// An actor has sent all of this lease.
-    Done(ActorId, u64),
+    /// An actor has sent all of this lease, but for what was lost.
+    Done(ActorId, u64, Vec<Loss>),
     /// All that an actor had sent by `Done` has been read.
     Fenced(Fence),
     /// An actor is there.
@@ -131,7 +131,7 @@ impl Shell {
         self.tell(match event {
             Event::Episode(actor, episode) => Input::Episode(actor, episode),
             Event::FrameRefused(reason) => Input::FrameRefused(reason),
-            Event::Done(actor, lease) => Input::Done(actor, lease),
+            Event::Done(actor, lease, losses) => Input::Done(actor, lease, losses),
             Event::Fenced(fence) => Input::Fenced(fence),
             Event::Heartbeat(actor) => Input::Heartbeat(actor),
             Event::Leaving(actor) => Input::Leaving(actor),

@@ -12,6 +12,7 @@ impl Coordinator {
     pub(super) fn moved(&mut self) {
         self.moved_at = self.now;
         self.joins = 0;
+        self.last_loss = None;
         if self.stands_still.take().is_some() {
             self.warned("the run goes on".into());
         }
@@ -40,6 +41,8 @@ impl Coordinator {
         let hung = self.actors.values().filter(|actor| actor.hung).count();
         if self.batches_in_training > 0 {
             "training is busy with one batch or an evaluation".into()
+        } else if let Some(detail) = &self.last_loss {
+            format!("environments fail: {detail}")
         } else if self.joins >= REJOINS {
             format!(
                 "actors joined {} times and brought nothing; logs/actor-0.log and others say why",

@@ -12,7 +12,7 @@ use rit_episode::Choice;
 fn batches(config: &Config, count: u64) -> Vec<Work> {
     let size = config.algorithm.n_rollout_threads as u64;
     let tasks = config.tasks(Split::Training);
-    let mut rollout = Rollout::new(tasks, config.environment_options(), config.seed, true);
+    let mut rollout = Rollout::new(tasks, rit_worlds::factory(config), config.seed, true);
     let mut batch = |first: u64| {
         let job = |number| Job { number, weights_version: 0, choice: Choice::EpsilonGreedy(1.0), task: None };
         let jobs: Vec<Job> = (first..first + size).map(job).collect();

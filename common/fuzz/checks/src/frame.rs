@@ -2,13 +2,14 @@
 
 use bytemuck::Zeroable as _;
 use rit_env::{
-    EnvironmentOptions, Script, Split, TaskSet,
+    Embedded, Script, Split, TaskSet,
     rollout::{Job, Rollout},
 };
 use rit_episode::{
     Choice, Dims, Episode, RunSeed,
     wire::{self, Expected, Frame, Header, PayloadLayout, RunId, TaskSize},
 };
+use std::sync::Arc;
 
 /// The first byte of an input: length and checksum are made right before the frame is read.
 pub const MENDED: u8 = 1;
@@ -85,7 +86,7 @@ pub fn seeds() -> Vec<(String, Vec<u8>)> {
 /// Episodes of the multi matrix game, from number 0 on.
 pub(crate) fn matrix_episodes(count: u64) -> Vec<Episode> {
     let tasks = TaskSet::MatrixGame.tasks(Split::Training);
-    let mut rollout = Rollout::new(tasks, EnvironmentOptions::default(), RunSeed(3), true);
+    let mut rollout = Rollout::new(tasks, Arc::new(Embedded::default()), RunSeed(3), true);
     let jobs: Vec<Job> = (0..count)
         .map(|number| Job { number, weights_version: 0, choice: Choice::EpsilonGreedy(1.0), task: None })
         .collect();

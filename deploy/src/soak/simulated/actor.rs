@@ -3,7 +3,11 @@
 
 use super::world::{Link, Machines, What, World};
 use crate::supervisor::{Exit, Place};
-use rit_learner::coordinator::Input;
+use rit_env::FailureKind;
+use rit_learner::{
+    coordinator::{Input, Loss},
+    ledger::ActorId,
+};
 use std::{collections::VecDeque, time::Duration};
 
 /// From one sign of life to the next.
@@ -16,7 +20,8 @@ const RECONNECT_TIMEOUT: Duration = Duration::from_secs(60);
 #[derive(Clone, Debug)]
 pub enum Up {
     Hello,
-    Done(u64),
+    /// With the numbers that were lost.
+    Done(u64, Vec<u64>),
     Heartbeat,
     Leaving,
     End,
@@ -38,6 +43,7 @@ pub enum Down {
 pub struct Rolling {
     lease: u64,
     left: VecDeque<u64>,
+    lost: Vec<u64>,
     version: u64,
 }
 
@@ -84,7 +90,11 @@ impl<M: Machines> World<M> {
         let actor = self.links[link].actor;
         match (message, actor) {
             (Up::Hello, _) => self.joins(link),
-            (Up::Done(lease), Some(actor)) => self.tell(Input::Done(actor, *lease)),
+            (Up::Done(lease, lost), Some(actor)) => {
+                let (kind, detail) = (FailureKind::Died, String::new());
+                let loss = Loss { kind, episodes: lost.clone(), detail };
+                self.tell(Input::Done(actor, *lease, vec![loss]));
+            }
             (Up::Heartbeat, Some(actor)) => self.tell(Input::Heartbeat(actor)),
             (Up::Leaving, Some(actor)) => self.tell(Input::Leaving(actor)),
             (Up::End, Some(actor)) => self.tell(Input::Gone(actor)),
@@ -108,7 +118,7 @@ impl<M: Machines> World<M> {
                 }
             }
             Down::Lease { lease, episodes, version } => {
-                let rolling = Rolling { lease, left: episodes.into(), version };
+                let rolling = Rolling { lease, left: episodes.into(), lost: Vec::new(), version };
                 let idle = self.actor_mut(process, |actor| {
                     actor.leases.push_back(rolling);
                     actor.leases.len() == 1
@@ -150,18 +160,36 @@ impl<M: Machines> World<M> {
         self.after(time, What::Rolled(link));
     }
 
-    /// An episode is rolled: its frame goes into shared memory.
+    /// An episode is rolled: its frame goes into shared memory. Or its environment lost it.
     pub fn rolled(&mut self, link: usize) {
-        let Link { process, learner, actor: Some(id), .. } = self.links[link] else { return };
+        let Link { process, actor: Some(id), .. } = self.links[link] else { return };
         if self.actor_mut(process, |actor| actor.link) != Some(Some(link)) {
             return;
         }
+        let is_lost = self.lost_episodes > 0;
         let sent = self.actor_mut(process, |actor| {
             let rolling = actor.leases.front_mut()?;
             let number = rolling.left.pop_front()?;
-            Some((number, rolling.version, rolling.lease, rolling.left.is_empty()))
+            rolling.lost.extend(is_lost.then_some(number));
+            Some((number, rolling.version, rolling.left.is_empty()))
         });
-        let Some(Some((number, version, lease, last))) = sent else { return };
+        let Some(Some((number, version, last))) = sent else { return };
+        if is_lost {
+            self.lost_episodes -= 1;
+        } else {
+            self.sends_frame(link, id, number, version);
+        }
+        if last {
+            let done = self.actor_mut(process, |actor| actor.leases.pop_front()).flatten();
+            done.into_iter().for_each(|Rolling { lease, lost, .. }| self.up(link, Up::Done(lease, lost)));
+        }
+        if self.actor_mut(process, |actor| !actor.leases.is_empty()) == Some(true) {
+            self.rolls(link);
+        }
+    }
+
+    fn sends_frame(&mut self, link: usize, actor: ActorId, number: u64, version: u64) {
+        let learner = self.links[link].learner;
         let damaged = self.damaged_frames > 0;
         self.damaged_frames = self.damaged_frames.saturating_sub(1);
         // What is in shared memory is read, whether or not its sender lives.
@@ -170,14 +198,7 @@ impl<M: Machines> World<M> {
         if let Some(reader) = self.learner.as_mut().filter(|reader| reader.life == learner) {
             reader.frames_until = reader.frames_until.max(at);
         }
-        self.at(at, What::Frame { learner, actor: id, number, version, damaged });
-        if last {
-            self.actor_mut(process, |actor| actor.leases.pop_front());
-            self.up(link, Up::Done(lease));
-        }
-        if self.actor_mut(process, |actor| !actor.leases.is_empty()) == Some(true) {
-            self.rolls(link);
-        }
+        self.at(at, What::Frame { learner, actor, number, version, damaged });
     }
 
     /// TERM, INT, or the end of its lifeline: it leaves in peace.

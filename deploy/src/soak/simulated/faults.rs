@@ -30,6 +30,8 @@ pub enum Fault {
     MemoryFull { ms: u64 },
     /// So many frames arrive damaged.
     Damage { frames: u32 },
+    /// Environments lose so many episodes.
+    Lose { episodes: u32 },
     /// An actor's link to the learner breaks; both live.
     BreakLink { which: usize },
     /// Messages take so much longer from now on.
@@ -109,7 +111,8 @@ fn fault(rng: &mut Rng) -> Fault {
         54..62 => Fault::Pause { ms: rng.random_range(0..8000) },
         62..68 => Fault::DiskFull { ms: rng.random_range(0..8000) },
         68..72 => Fault::MemoryFull { ms: rng.random_range(0..MEMORY_FULL_MS) },
-        72..78 => Fault::Damage { frames: rng.random_range(1..4) },
+        72..75 => Fault::Damage { frames: rng.random_range(1..4) },
+        75..78 => Fault::Lose { episodes: rng.random_range(1..4) },
         78..86 => Fault::BreakLink { which },
         86..90 => Fault::Slow { ms: rng.random_range(0..400) },
         90..94 => Fault::PowerLoss,

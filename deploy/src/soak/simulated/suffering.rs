@@ -41,6 +41,7 @@ impl<M: Machines> World<M> {
             Fault::DiskFull { ms } => self.disk_full_until = self.now + Duration::from_millis(ms),
             Fault::MemoryFull { ms } => self.memory_full_until = self.now + Duration::from_millis(ms),
             Fault::Damage { frames } => self.damaged_frames += frames,
+            Fault::Lose { episodes } => self.lost_episodes += episodes,
             Fault::BreakLink { which } => self.breaks_link(which),
             Fault::Slow { ms } => self.latency_ms = ms + 1,
             Fault::PowerLoss => self.loses_power(),
@@ -111,7 +112,8 @@ impl<M: Machines> World<M> {
 
     pub(super) fn peace(&mut self) {
         self.peace_since = Some(self.now);
-        (self.disk_full_until, self.memory_full_until, self.damaged_frames) = (self.now, self.now, 0);
+        (self.disk_full_until, self.memory_full_until) = (self.now, self.now);
+        (self.damaged_frames, self.lost_episodes) = (0, 0);
         for process in 0..self.processes.len() {
             self.goes_on(process);
         }

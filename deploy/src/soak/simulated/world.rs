@@ -214,6 +214,7 @@ pub struct World<M: Machines> {
     pub disk_full_until: Duration,
     pub memory_full_until: Duration,
     pub damaged_frames: u32,
+    pub lost_episodes: u32,
     /// Milliseconds that an episode takes at most.
     pub roll_ms: u64,
     /// Something happened that ends a run in failure, rightly.
@@ -262,6 +263,7 @@ impl<M: Machines> World<M> {
             disk_full_until: Duration::ZERO,
             memory_full_until: Duration::ZERO,
             damaged_frames: 0,
+            lost_episodes: 0,
             may_fail: false,
             begun: false,
             may_end_early: false,

@@ -1,11 +1,12 @@
 use super::*;
 use crate::Script;
 use crate::{
-    EnvironmentOptions, Split, TaskSet,
+    Embedded, Split, TaskSet,
     rollout::{Job, Rollout, all_rolled},
 };
 use rand::RngExt as _;
 use rit_episode::{Choice, Exploration, Policy as _, RunSeed, Stream};
+use std::sync::Arc;
 
 /// Mean total reward of a script over testing tasks, mixed evenly, and its standard error.
 fn mean_reward(set: TaskSet, mut script: Script, episodes: usize) -> (f64, f64) {
@@ -17,7 +18,7 @@ fn mean_reward(set: TaskSet, mut script: Script, episodes: usize) -> (f64, f64) 
         task: Some(number % tasks.len()),
     };
     let jobs: Vec<Job> = (0..episodes).map(job).collect();
-    let mut rollout = Rollout::new(tasks.clone(), EnvironmentOptions::default(), RunSeed(0), true);
+    let mut rollout = Rollout::new(tasks.clone(), Arc::new(Embedded::default()), RunSeed(0), true);
     let rewards: Vec<f64> = all_rolled(rollout.roll(&mut script, &jobs))
         .unwrap()
         .iter()

@@ -1,0 +1,35 @@
+//! Where worlds come from. Tasks of this crate are played in this process; what else there is, such as games behind
+//! a network, is built above it.
+
+use crate::{Environment, EnvironmentError, EnvironmentOptions, Spec, Task};
+
+/// Makes the worlds of tasks. Whoever rolls episodes asks for a world when it has none that is idle, and again after
+/// one has failed.
+pub trait EnvironmentFactory: Send + Sync {
+    /// What a task is in these worlds, as data: nothing is built for it.
+    fn spec(&self, task: Task) -> Spec {
+        task.spec()
+    }
+
+    /// Makes a world. What takes its time, such as starting a process, belongs into [`Environment::begin_reset`],
+    /// so that several worlds do it side by side.
+    ///
+    /// # Errors
+    /// When there can be none. The episode that it was for is lost.
+    fn build(&self, task: Task) -> Result<Box<dyn Environment>, EnvironmentError>;
+
+    /// Most worlds that may play at once; embedded ones are as many as anybody likes.
+    fn worlds_max(&self) -> usize {
+        usize::MAX
+    }
+}
+
+/// The worlds of this crate, played with these options.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Embedded(pub EnvironmentOptions);
+
+impl EnvironmentFactory for Embedded {
+    fn build(&self, task: Task) -> Result<Box<dyn Environment>, EnvironmentError> {
+        Ok(task.environment(self.0))
+    }
+}
