@@ -41,6 +41,8 @@ pub enum Command {
     Plot(PlotOptions),
     /// Make an authority, and certificates for a learner and for those who call it over TCP
     Certificates(CertificatesOptions),
+    /// List runs: what each is, how it stands, and what it has reached
+    Runs(RunsOptions),
     /// List the task sets' experiments and the algorithms that come with the program
     Experiments,
     /// Print completions for a shell, such as `rit completions bash > /etc/bash_completion.d/rit`
@@ -60,6 +62,10 @@ pub struct ConfigOptions {
     /// set anew, such as --steps or --actors
     #[arg(long, value_name = "DIR", conflicts_with_all = ["run_dir", "seed"])]
     pub resume: Option<PathBuf>,
+    /// Begin with another run's weights: its newest checkpoint's, those of a checkpoint (RUN@STEPS), or a weights
+    /// file. Features, actions and sizes of the networks must be the same; teams, tasks, rewards and settings need not
+    #[arg(long, value_name = "RUN[@STEPS]", conflicts_with = "resume")]
+    pub from: Option<PathBuf>,
     /// The algorithm, in place of the experiment's; `rit experiments` lists them
     #[arg(long, value_name = "NAME")]
     pub algorithm: Option<String>,
@@ -184,6 +190,16 @@ pub struct CertificatesOptions {
     /// Days that they are valid for
     #[arg(long, value_name = "N", default_value_t = 365, value_parser = within::<u32>(1, 3650))]
     pub days: u32,
+}
+
+#[derive(Args, Debug)]
+pub struct RunsOptions {
+    /// Folder whose runs are listed, those in folders of it too
+    #[arg(value_name = "DIR", default_value = "runs")]
+    pub dir: PathBuf,
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// Who plays, and what.

@@ -4,9 +4,8 @@ use crate::output;
 use rit_actor::ActorError;
 use rit_config::{ConfigError, RunDirError};
 use rit_env::{TaskError, UnfitScript, UnknownName, rollout::LostEpisode};
-use rit_learner::{
-    LearnerError, evaluation::TasksError, trainer::TrainError, weights_file::WeightsFileError,
-};
+use rit_learner::{LearnerError, evaluation::TasksError, trainer::TrainError};
+use rit_policy::{CarryOverError, WeightsFileError};
 use rit_proto::transport::{ConnectError, CredentialsError, status_words};
 use std::{fmt, process::ExitCode};
 
@@ -130,6 +129,12 @@ impl From<WeightsFileError> for Failure {
     }
 }
 
+impl From<CarryOverError> for Failure {
+    fn from(error: CarryOverError) -> Self {
+        Self::input(error)
+    }
+}
+
 impl From<ConnectError> for Failure {
     fn from(error: ConnectError) -> Self {
         if error.may_pass() { Self::runtime(error) } else { Self::input(error) }
@@ -152,6 +157,7 @@ impl From<LearnerError> for Failure {
             LearnerError::Access(_)
             | LearnerError::Address(_)
             | LearnerError::Model(_)
+            | LearnerError::Initial(_)
             | LearnerError::Checkpoint(_)
             | LearnerError::Train(TrainError::Metrics { .. }) => Self::input(error),
             _ => Self::runtime(error),

@@ -2,7 +2,8 @@
 
 use crate::{failure::Failure, report};
 use rit_config::RunDir;
-use rit_learner::{checkpoint::LATEST, metrics::Line};
+use rit_learner::metrics::Line;
+use rit_policy::place::LATEST;
 use rit_proto::v1::TaskResult;
 use serde_json::{Value, json};
 use std::{
@@ -46,6 +47,16 @@ impl Finished {
             "" | "finished" => self.figures(),
             how => format!("{}\n{}", report::printable(how), self.figures()),
         }
+    }
+
+    /// How it ended, in a word; nothing where that was altered.
+    pub fn ended(&self) -> &str {
+        self.summary["ended"].as_str().unwrap_or_default()
+    }
+
+    /// How far training came.
+    pub fn env_steps(&self) -> u64 {
+        self.number("env_steps")
     }
 
     /// How it ended, and why if it failed.

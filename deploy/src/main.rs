@@ -1,6 +1,7 @@
 //! The `rit` binary: one program, many processes. `rit train` starts `rit learner` and several `rit actor` by
 //! executing itself; the same sub-commands are what a service unit or a cluster starts.
 
+mod beginning;
 mod bench;
 mod certificates;
 mod child;
@@ -21,6 +22,7 @@ mod processes;
 mod progress;
 mod render;
 mod report;
+mod runs;
 mod shutdown;
 mod soak;
 mod supervisor;
@@ -71,6 +73,7 @@ async fn run(cli: Cli) -> Result<ExitCode, Failure> {
         Command::Bench(options) => bench::run(&options),
         Command::Plot(options) => plot::run(&options),
         Command::Certificates(options) => certificates::run(&options),
+        Command::Runs(options) => runs::run(&options),
         Command::Experiments => experiments::print(),
         Command::Completions { shell } => {
             let mut script = Vec::new();

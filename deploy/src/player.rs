@@ -5,11 +5,8 @@ use rit_algo::{Acting, Model};
 use rit_config::{Config, RunDir};
 use rit_env::Script;
 use rit_episode::{Policy, RunSeed};
-use rit_learner::{
-    checkpoint::{self, WEIGHTS},
-    trainer::evaluation_seed,
-    weights_file,
-};
+use rit_learner::{checkpoint, trainer::evaluation_seed};
+use rit_policy::{place::WEIGHTS, weights_file};
 use std::{path::Path, sync::Arc};
 
 /// The policy of a checkpoint, as it is typed.

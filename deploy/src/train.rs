@@ -1,6 +1,7 @@
 //! `rit train`: a learner and its actors on this host, from beginning to end.
 
 use crate::{
+    beginning::Beginning,
     cli::{ConfigOptions, TrainOptions},
     experiments::{self, Experiment},
     failure::Failure,
@@ -20,7 +21,7 @@ use tracing::Instrument as _;
 
 /// `rit train`.
 pub async fn run(options: TrainOptions, logs: LogOptions) -> Result<ExitCode, Failure> {
-    let (owned, config, name) = prepare(&options.config)?;
+    let Prepared { owned, config, said } = prepare(&options.config)?;
     let started = refuse_no_actors(&config)
         .and_then(|()| logs.start_in(&owned.run_dir().logs().join("train.log"), "train"));
     let span = match started {
@@ -30,21 +31,19 @@ pub async fn run(options: TrainOptions, logs: LogOptions) -> Result<ExitCode, Fa
             return Err(failure);
         }
     };
-    supervise(owned, &config, &name, &logs, options.json).instrument(span).await
+    supervise(owned, &config, &said, &logs, options.json).instrument(span).await
 }
 
 async fn supervise(
     owned: OwnedRunDir,
     config: &Config,
-    name: &str,
+    said: &[String],
     logs: &LogOptions,
     json: bool,
 ) -> Result<ExitCode, Failure> {
     let run_dir = owned.run_dir();
     let mut progress = Progress::new(config.training.t_max, json);
-    let root = run_dir.root().display();
-    progress.say(&format!("{name}: learner and {} actors, run directory {root}", config.actors.count));
-    owned.notices().iter().for_each(|notice| progress.say(notice));
+    said.iter().chain(owned.notices()).for_each(|words| progress.say(words));
     if let Some(words) = too_many_actors(config.actors.count) {
         progress.say(&words);
     }
@@ -77,29 +76,48 @@ async fn supervise(
     }
 }
 
-/// A new run's directory, or that of a run to go on with; its configuration and what it is called.
-fn prepare(options: &ConfigOptions) -> Result<(OwnedRunDir, Config, String), Failure> {
+/// A run that is about to begin or to go on.
+struct Prepared {
+    owned: OwnedRunDir,
+    config: Config,
+    /// What a person is told of it first.
+    said: Vec<String>,
+}
+
+/// A new run's directory, or that of a run to go on with.
+fn prepare(options: &ConfigOptions) -> Result<Prepared, Failure> {
     let settings = experiments::settings(options);
-    let (run_dir, config, name) = match (&options.resume, &options.experiment) {
+    let (owned, config, name, beginning) = match (&options.resume, &options.experiment) {
         (Some(root), _) => {
-            let (run_dir, config) = OwnedRunDir::resume(root, &experiments::parse_settings(&settings)?)?;
+            let (owned, config) = OwnedRunDir::resume(root, &experiments::parse_settings(&settings)?)?;
             let name = format!("going on with {}", config.environment.task_set);
-            (run_dir, config, name)
+            (owned, config, name, None)
         }
         (None, Some(experiment)) => {
-            let Experiment { name, config } = experiments::load(experiment, &settings)?;
+            let Experiment { name, mut config } = experiments::load(experiment, &settings)?;
             let name =
                 options.algorithm.as_ref().map_or(name.clone(), |algorithm| format!("{name}-{algorithm}"));
             refuse_no_actors(&config)?;
-            let run_dir = match &options.run_dir {
+            let from = options.from.as_ref();
+            let beginning = from.map(|from| Beginning::from(from, &mut config)).transpose()?;
+            let owned = match &options.run_dir {
                 Some(root) => OwnedRunDir::create(root, &config)?,
                 None => OwnedRunDir::create_fresh(Path::new("runs"), &name, &config)?,
             };
-            (run_dir, config, name)
+            (owned, config, name, beginning)
         }
         (None, None) => return Err(Failure::input_message("which experiment? `rit experiments` lists them")),
     };
-    Ok((run_dir, config, name))
+    let root = owned.run_dir().root().display();
+    let mut said = vec![format!("{name}: learner and {} actors, run directory {root}", config.actors.count)];
+    if let Some(beginning) = beginning {
+        if let Err(failure) = beginning.write(owned.run_dir()) {
+            owned.undo()?;
+            return Err(failure);
+        }
+        said.push(beginning.words().to_owned());
+    }
+    Ok(Prepared { owned, config, said })
 }
 
 /// What to say of more actors than the machine has work for.

@@ -27,7 +27,6 @@ pub use origin::{FORMAT_VERSION, Origin, OtherOrigin};
 use crate::{
     replay_log::{ReplayLogError, remedy},
     weights::Snapshot,
-    weights_file::{self, WeightsFileError},
 };
 use folders::PARTIAL;
 use rit_algo::{
@@ -35,6 +34,11 @@ use rit_algo::{
     learner::{NamedState, Numbers},
 };
 use rit_config::{Algorithm, RunDir};
+use rit_policy::{
+    TaskNames, WeightsFileError,
+    place::{LATEST, WEIGHTS},
+    weights_file,
+};
 use safetensors::{Dtype, SafeTensorError, SafeTensors, tensor::TensorView};
 use sha2::{Digest as _, Sha256};
 use std::{
@@ -44,13 +48,9 @@ use std::{
     path::{Path, PathBuf},
 };
 
-/// The weights' file inside a checkpoint.
-pub const WEIGHTS: &str = "weights.safetensors";
 const STATE: &str = "state.safetensors";
 const MANIFEST: &str = "checkpoint.json";
 const SUMS: &str = "SHA256SUMS";
-/// The link to the newest checkpoint.
-pub const LATEST: &str = "latest";
 /// No file of a checkpoint is longer: whatever lies in its place is not read to its end.
 const FILE_BYTES_MAX: u64 = 1 << 36;
 
@@ -169,6 +169,7 @@ pub fn newest_manifest(run_dir: &RunDir) -> Option<Manifest> {
 pub fn save(
     run_dir: &RunDir,
     model: &Model,
+    names: &TaskNames,
     state: &TrainingState,
     keep: usize,
 ) -> Result<PathBuf, CheckpointError> {
@@ -178,7 +179,7 @@ pub fn save(
     let name = folders::free_name(&all, state.manifest.progress.env_steps)?;
     let (folder, partial) = (all.join(&name), all.join(format!("{name}.{PARTIAL}")));
     fs::create_dir(&partial).map_err(io(&partial))?;
-    let written = write_folder(&partial, model, state);
+    let written = write_folder(&partial, model, names, state);
     if written.is_err() {
         // What could not be written whole takes no space. If that fails too, the next attempt removes it.
         let _ = fs::remove_dir_all(&partial);
@@ -197,7 +198,12 @@ pub fn save(
     Ok(Path::new("checkpoints").join(name))
 }
 
-fn write_folder(folder: &Path, model: &Model, state: &TrainingState) -> Result<(), CheckpointError> {
+fn write_folder(
+    folder: &Path,
+    model: &Model,
+    names: &TaskNames,
+    state: &TrainingState,
+) -> Result<(), CheckpointError> {
     let format = |name: &str| {
         let path = folder.join(name);
         move |error| CheckpointError::Format { path, error }
@@ -205,7 +211,7 @@ fn write_folder(folder: &Path, model: &Model, state: &TrainingState) -> Result<(
     let manifest = serde_json::to_vec_pretty(&state.manifest);
     let manifest = manifest.map_err(|error| io(&folder.join(MANIFEST))(error.into()))?;
     let files = [
-        (WEIGHTS, weights_file::encode(model.layout(), &state.params).map_err(format(WEIGHTS))?),
+        (WEIGHTS, weights_file::encode(model, names, &state.params).map_err(format(WEIGHTS))?),
         (STATE, encode_state(state).map_err(format(STATE))?),
         (MANIFEST, manifest),
     ];

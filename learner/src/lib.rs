@@ -12,6 +12,7 @@ pub mod coordinator;
 pub mod episodes_service;
 pub mod evaluation;
 pub mod gauges;
+mod initial;
 pub mod ledger;
 pub mod life;
 pub mod measured;
@@ -29,8 +30,8 @@ pub mod tensorboard;
 pub mod trainer;
 pub mod web;
 pub mod weights;
-pub mod weights_file;
 pub mod write_queue;
 pub mod writer;
 
+pub use initial::InitialError;
 pub use run::{LearnerError, expected, run};

@@ -5,6 +5,7 @@ use crate::{
     control_service::ControlService,
     coordinator::{Coordinator, Event, Shell},
     episodes_service::EpisodesService,
+    initial::{InitialError, initial_params},
     life::{self, EndOfLife, LifeError},
     receive::receive,
     replay_log::{ReplayLog, ReplayLogError},
@@ -20,11 +21,9 @@ use crate::{
 use rit_algo::{ConfigError, Learner, Model};
 use rit_config::{Config, RunDir, Tls};
 use rit_env::Split;
-use rit_episode::{
-    Stream,
-    wire::{Expected, PayloadLayout},
-};
+use rit_episode::wire::{Expected, PayloadLayout};
 use rit_ipc::{CreateError, EpisodeReceiver, Limits, ReceiveError};
+use rit_policy::TaskNames;
 use rit_proto::{
     transport::{
         Access, AccessError, AccessFiles, Address, AddressError, Incoming, ListenError, REQUEST_BYTES_MAX,
@@ -88,6 +87,9 @@ pub enum LearnerError {
     /// The configuration makes no model.
     #[error(transparent)]
     Model(#[from] ConfigError),
+    /// The weights that it begins with cannot be had.
+    #[error(transparent)]
+    Initial(#[from] InitialError),
     /// There are checkpoints and none can be used.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
@@ -124,7 +126,7 @@ pub async fn run(
     let doors = listen(&run_dir, &config).await?;
     let web = Web::bind(&run_dir, config.web.listen).await?;
     let model = Arc::new(Model::new(config.model())?);
-    let params = model.initial(&mut config.seed.stream(Stream::Weights, 0));
+    let params = initial_params(&run_dir, &config, &model)?;
     let learner = rit_algo::learner(Arc::clone(&model), config.update(), params).map_err(|error| {
         LearnerError::Io { what: "the update's threads".into(), error: io::Error::other(error) }
     })?;
@@ -147,6 +149,7 @@ pub async fn run(
     let writer = Writer {
         run_dir: run_dir.clone(),
         model: Arc::clone(&model),
+        names: TaskNames::of(&config),
         log: ReplayLog::open(&run_dir.replay(), expected.layout, run_dir.lineage(), episodes)?,
         replay_episodes: config.replay_episodes(),
         keep: config.checkpoints.keep,

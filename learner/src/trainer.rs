@@ -14,7 +14,6 @@ use crate::{
     summary::{Ended, Summary},
     tensorboard::{EventFile, Position},
     weights::{Snapshot, WeightsBoard},
-    weights_file,
     write_queue::WriteQueue,
     writer::Written,
 };
@@ -25,6 +24,7 @@ use rit_algo::{
 use rit_config::{Config, RunDir, Until};
 use rit_env::{Split, rollout::LostEpisode};
 use rit_episode::{Episode, RunSeed, Stream};
+use rit_policy::weights_file;
 use std::{
     collections::VecDeque,
     io,

@@ -13,6 +13,7 @@ use crate::{
 use rit_algo::Model;
 use rit_config::RunDir;
 use rit_episode::Episode;
+use rit_policy::TaskNames;
 use std::{
     collections::VecDeque,
     path::PathBuf,
@@ -42,6 +43,8 @@ pub struct Writer {
     pub run_dir: RunDir,
     /// Whose weights are written.
     pub model: Arc<Model>,
+    /// What goes in and comes out of them is called.
+    pub names: TaskNames,
     /// Replay on disk.
     pub log: ReplayLog,
     /// Episodes that replay holds; 0 without.
@@ -106,7 +109,7 @@ impl Writer {
     ) -> Result<PathBuf, CheckpointError> {
         self.append(waiting)?;
         self.log.sync()?;
-        let path = checkpoint::save(&self.run_dir, &self.model, state, self.keep)?;
+        let path = checkpoint::save(&self.run_dir, &self.model, &self.names, state, self.keep)?;
         self.log.forget_before(checkpoint::replay_needed_from(&self.run_dir, self.replay_episodes)?)?;
         Ok(path)
     }

@@ -100,11 +100,36 @@ pub enum ConfigError {
 }
 
 impl ModelConfig {
-    /// Checks that there is such a model.
-    ///
-    /// # Errors
-    /// The first thing that no model can have.
-    pub fn validate(&self) -> Result<(), ConfigError> {
+    /// A model of this method and these sizes, by name, the others 0; what its losses alone have is the default. What
+    /// is missing, [`Self::validate`] tells.
+    pub fn of_sizes(method: Method, encoder: Encoder, size: impl Fn(&str) -> usize) -> Self {
+        Self {
+            method,
+            encoder,
+            entity_dim: size("entity_dim"),
+            n_actions: size("n_actions"),
+            agents_max: size("agents_max"),
+            entities_max: size("entities_max"),
+            hidden_dim: size("hidden_dim"),
+            attention_dim: size("attention_dim"),
+            n_heads: size("n_heads"),
+            n_blocks: size("n_blocks"),
+            task_representation_dim: size("task_representation_dim"),
+            reward_embed_dim: size("reward_embed_dim"),
+            mixing_embed_dim: size("mixing_embed_dim"),
+            hypernet_embed_dim: size("hypernet_embed_dim"),
+            feedforward_dim: size("feedforward_dim"),
+            imagined_weight: 0.5,
+            role: RoleConfig {
+                dim: size("role_dim"),
+                hidden_dim: size("role_hidden_dim"),
+                ..RoleConfig::default()
+            },
+        }
+    }
+
+    /// The sizes that its method has a use for, by name.
+    pub fn sizes(&self) -> Vec<(&'static str, usize)> {
         let facts = self.method.facts();
         let mut sizes = vec![
             ("entity_dim", self.entity_dim),
@@ -138,10 +163,18 @@ impl ModelConfig {
         if self.method == Method::Roma {
             sizes.extend([("role_dim", self.role.dim), ("role_hidden_dim", self.role.hidden_dim)]);
         }
-        if let Some((name, _)) = sizes.into_iter().find(|(_, size)| *size == 0) {
+        sizes
+    }
+
+    /// Checks that there is such a model.
+    ///
+    /// # Errors
+    /// The first thing that no model can have.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        if let Some((name, _)) = self.sizes().into_iter().find(|(_, size)| *size == 0) {
             return Err(ConfigError::Zero { name });
         }
-        let (name, size) = match facts.encoder {
+        let (name, size) = match self.method.facts().encoder {
             Encoder::Flat => ("hidden_dim", self.hidden_dim),
             _ => ("attention_dim", self.attention_dim),
         };

@@ -44,6 +44,21 @@ pub enum Encoder {
     Flat,
 }
 
+impl Encoder {
+    /// All of them.
+    pub const ALL: [Self; 4] = [Self::Beside, Self::Within, Self::Tokens, Self::Flat];
+
+    /// What a weights file calls it.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Beside => "beside",
+            Self::Within => "within",
+            Self::Tokens => "tokens",
+            Self::Flat => "flat",
+        }
+    }
+}
+
 /// How utilities become Q_total.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Mixing {

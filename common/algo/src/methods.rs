@@ -50,6 +50,14 @@ pub struct Acting(Box<dyn Actor>);
 
 /// What a method's acting networks must do.
 pub(crate) trait Actor: Policy + Send {
+    /// Utilities, or logits, of the last step.
+    fn utilities(&self) -> &[f32];
+
+    /// z of the last step; nothing without task representations.
+    fn task_representations(&self) -> &[f32] {
+        &[]
+    }
+
     /// Takes other acting parameters. Between episodes only: a running one would go on with histories of the old.
     ///
     /// # Panics
@@ -71,6 +79,19 @@ impl Acting {
             Network::Refil(network) => Box::new(ValueActing::new(network, params)),
             Network::Roma(network) => Box::new(ValueActing::new(network, params)),
         })
+    }
+
+    /// The utilities of the last step, turn after turn, agents in decision order, `[agent rows, A]`: each agent's Q given
+    /// the actions chosen before its own; logits where the method has a policy network. Unavailable actions have theirs
+    /// too.
+    pub fn utilities(&self) -> &[f32] {
+        self.0.utilities()
+    }
+
+    /// The task representations z of the last step, turn after turn, agents in decision order, `[agent rows, h_z]`;
+    /// nothing where the method has none.
+    pub fn task_representations(&self) -> &[f32] {
+        self.0.task_representations()
     }
 
     /// Takes other weights. Between episodes only: a running one would go on with histories of the old.

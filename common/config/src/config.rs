@@ -153,6 +153,8 @@ pub struct Network {
     #[serde(serialize_with = "number::shortest")]
     pub role_variance_floor: f32,
     pub n_blocks: usize,
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub initial_weights: String,
 }
 
 /// `[training]`.

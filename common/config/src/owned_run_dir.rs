@@ -4,8 +4,8 @@ use crate::{
     Config, RunDir, RunDirError, method_keys,
     resolve::may_go_on,
     run_dir::{
-        CONFIG, LINEAGE, RUN_ID, TOKEN, existing, hex, random_bytes, read_config, utf8, why_missing,
-        write_whole,
+        CONFIG, INITIAL_WEIGHTS, LINEAGE, RUN_ID, TOKEN, existing, hex, random_bytes, read_config, utf8,
+        why_missing, write_whole,
     },
     run_lock::{LOCK, RunLock},
     run_place::{self, Came, PLACE},
@@ -275,7 +275,7 @@ fn remove_beginning(root: &Path, folder_made: bool) -> io::Result<()> {
             remove_if_there(&entry.path())?;
         }
     }
-    for name in [RUN_ID, TOKEN, PLACE, CONFIG, LOCK].iter().chain(&FOUND_BY) {
+    for name in [RUN_ID, TOKEN, PLACE, CONFIG, LOCK, INITIAL_WEIGHTS].iter().chain(&FOUND_BY) {
         let path = root.join(name);
         remove_if_there(&path)?;
         remove_if_there(&path.with_extension("partial"))?;

@@ -1,7 +1,7 @@
 //! The run directory: where everything of one run lies, and under which names.
 
 use crate::{
-    Config, ConfigError, read_text,
+    Config, ConfigError, read_text, run_lock,
     saved::{self, Saved, resolve_saved},
 };
 use rit_episode::wire::RunId;
@@ -17,6 +17,8 @@ pub(crate) const RUN_ID: &str = "run_id";
 pub(crate) const TOKEN: &str = "token";
 /// In a copy: the identity of the run that it was copied from.
 pub(crate) const LINEAGE: &str = "lineage";
+/// Weights of another run that this one begins with.
+pub(crate) const INITIAL_WEIGHTS: &str = "initial.safetensors";
 
 /// One run's directory. Only its user may look inside.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -183,6 +185,11 @@ impl RunDir {
         self.root.join("learner.sock")
     }
 
+    /// The weights that the run began with, where they are another run's.
+    pub fn initial_weights(&self) -> PathBuf {
+        self.root.join(INITIAL_WEIGHTS)
+    }
+
     /// One JSON object a line.
     pub fn metrics(&self) -> PathBuf {
         self.root.join("metrics.jsonl")
@@ -211,6 +218,11 @@ impl RunDir {
     /// One file a process.
     pub fn logs(&self) -> PathBuf {
         self.root.join("logs")
+    }
+
+    /// Whether a process writes to it now.
+    pub fn is_in_use(&self) -> bool {
+        run_lock::is_taken(&self.root)
     }
 
     /// Where the learner's shared memory is administered: a line of text, written anew by each learner.

@@ -100,6 +100,12 @@ fn try_lock(root: &Path) -> Result<Option<File>, RunDirError> {
     }
 }
 
+/// Whether a process has the lock of this directory. A look alone: only where a process of the holder's number lives is
+/// the lock itself touched, and given back at once.
+pub(crate) fn is_taken(root: &Path) -> bool {
+    holders(root).into_iter().any(is_alive) && matches!(try_lock(root), Ok(None))
+}
+
 fn holders(root: &Path) -> Vec<u32> {
     let text = fs::read_to_string(root.join(LOCK)).unwrap_or_default();
     text.lines().filter_map(|line| line.trim().parse().ok()).collect()
@@ -123,6 +129,7 @@ mod tests {
         let lock = RunLock::take(folder.path()).unwrap();
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0, "taking it makes nothing");
         RunLock::tell_holder(folder.path(), true);
+        assert!(is_taken(folder.path()));
         let error = RunLock::take(folder.path()).unwrap_err();
         assert!(
             matches!(error, RunDirError::InUse { holder: Some(pid), .. } if pid == process::id()),
@@ -130,6 +137,7 @@ mod tests {
         );
         assert!(error.to_string().contains(&format!("process {}", process::id())), "{error}");
         drop(lock);
+        assert!(!is_taken(folder.path()), "though this process lives");
         RunLock::take(folder.path()).unwrap();
     }
 

@@ -42,7 +42,7 @@ fn roll(environment: &mut dyn Environment, episode: u64) -> Vec<(Observation, Op
     loop {
         let mut observation = Observation::new(n, m, features, n_actions);
         environment.observe(&mut observation);
-        check_observation(&observation);
+        assert_eq!(observation.check(), Ok(()), "a state is one that may be");
         assert_eq!(environment.spec(), spec, "what a task is does not change");
         assert!(
             environment.scene().map(|scene| scene.bodies.len()) == spec.has_scenes.then_some(m),
@@ -59,18 +59,6 @@ fn roll(environment: &mut dyn Environment, episode: u64) -> Vec<(Observation, Op
         let step = environment.step(&actions, rng).expect("a legal joint action is taken");
         assert!(step.reward.is_finite() && step.shaping.is_finite(), "rewards are finite");
         course.push((observation, Some(step)));
-    }
-}
-
-fn check_observation(observation: &Observation) {
-    let m = observation.n_entities();
-    assert!(observation.entities().iter().all(|feature| feature.is_finite()), "features are finite");
-    let flags = observation.observable().iter().chain(observation.available());
-    assert!(flags.into_iter().all(|&flag| flag <= 1), "flags are 0 or 1");
-    for agent in 0..observation.n_agents() {
-        let seen = &observation.observable()[agent * m..][..m];
-        assert!(seen[agent] == 1 || seen.iter().all(|&flag| flag == 0), "an agent sees itself, or nothing");
-        assert!(observation.available_to(agent).contains(&1), "everyone has something to do");
     }
 }
 

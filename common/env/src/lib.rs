@@ -12,6 +12,7 @@ pub mod conformance;
 mod environment;
 mod factory;
 pub mod matrix_game;
+mod names;
 pub mod particle;
 pub mod rollout;
 mod scripts;

@@ -1,27 +1,24 @@
 //! An environment seen in decision order.
 
 use crate::{Environment, EnvironmentError, Spec, Step};
-use rit_episode::{Action, Observation, Rng, decision_order};
+use rit_episode::{Action, Observation, Rng, Seating, decision_order};
 
-/// An environment whose agents sit in decision order: row k is the k-th to decide. The order reorders every
-/// axis that indexes agents, and joint actions are mapped back before the environment steps. Each agent's
-/// features are followed by the one-hot of its last action: zeros at the first step and for non-agents.
+/// An environment whose agents sit in decision order: see [`Seating`].
 pub struct Seated {
     environment: Box<dyn Environment>,
     spec: Spec,
-    decision_order: Vec<u8>,
+    seating: Seating,
     /// The environment's own view, agents in its own order.
     inner: Observation,
-    /// Last joint action in the environment's order; `None` at the first step.
-    last_actions: Option<Vec<Action>>,
 }
 
 impl Seated {
     /// Takes an environment; [`Seated::reset`] comes before anything else.
     pub fn new(environment: Box<dyn Environment>) -> Self {
         let spec = environment.spec();
-        let decision_order = decision_order::identity(spec.n_agents);
-        Self { environment, spec, decision_order, inner: Observation::default(), last_actions: None }
+        let mut seating = Seating::default();
+        seating.begin(decision_order::identity(spec.n_agents));
+        Self { environment, spec, seating, inner: Observation::default() }
     }
 
     /// What the environment's task is.
@@ -43,9 +40,7 @@ impl Seated {
     /// When the order is not a permutation of the environment's agents.
     pub fn begin_reset(&mut self, order: Vec<u8>, rng: &mut Rng) -> Result<(), EnvironmentError> {
         assert_eq!(order.len(), self.spec.n_agents, "one place for each agent");
-        assert!(decision_order::is_permutation(&order), "a decision order is a permutation");
-        self.decision_order = order;
-        self.last_actions = None;
+        self.seating.begin(order);
         self.environment.begin_reset(rng)
     }
 
@@ -62,24 +57,7 @@ impl Seated {
         let Spec { n_agents: n, n_entities: m, feature_dim: features, n_actions, .. } = self.spec;
         self.inner.reset(n, m, features, n_actions);
         self.environment.observe(&mut self.inner);
-
-        observation.reset(n, m, features + n_actions, n_actions);
-        for row in 0..m {
-            let entity = self.entity_at(row);
-            let to = observation.entity_mut(row);
-            to[..features].copy_from_slice(&self.inner.entities()[entity * features..][..features]);
-            if let Some(actions) = self.last_actions.as_ref().filter(|_| row < n) {
-                to[features + usize::from(actions[entity])] = 1.0;
-            }
-        }
-        for row in 0..n {
-            let agent = self.entity_at(row);
-            for column in 0..m {
-                let entity = self.entity_at(column);
-                observation.observable_mut(row)[column] = self.inner.observable()[agent * m + entity];
-            }
-            observation.available_mut(row).copy_from_slice(self.inner.available_to(agent));
-        }
+        self.seating.seat(&self.inner, observation);
     }
 
     /// Tells the environment a joint action in decision order; [`Self::step`] follows.
@@ -87,12 +65,8 @@ impl Seated {
     /// # Errors
     /// When the environment cannot be told.
     pub fn begin_step(&mut self, actions: &[Action]) -> Result<(), EnvironmentError> {
-        let last = self.last_actions.get_or_insert_default();
-        last.resize(actions.len(), 0);
-        for (&agent, &action) in self.decision_order.iter().zip(actions) {
-            last[usize::from(agent)] = action;
-        }
-        self.environment.begin_step(last)
+        self.seating.take(actions);
+        self.environment.begin_step(self.seating.last_actions())
     }
 
     /// What the joint action told last leads to.
@@ -100,12 +74,7 @@ impl Seated {
     /// # Errors
     /// When the environment cannot go on.
     pub fn step(&mut self, rng: &mut Rng) -> Result<Step, EnvironmentError> {
-        self.environment.step(self.last_actions.get_or_insert_default(), rng)
-    }
-
-    /// The environment's entity that sits in this row.
-    fn entity_at(&self, row: usize) -> usize {
-        self.decision_order.get(row).map_or(row, |&agent| usize::from(agent))
+        self.environment.step(self.seating.last_actions(), rng)
     }
 }
 

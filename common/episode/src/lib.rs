@@ -10,14 +10,16 @@ mod episode;
 mod exploration;
 mod observation;
 mod policy;
+mod seating;
 pub mod streams;
 pub mod wire;
 
 pub use dims::{Dims, DimsError};
 pub use episode::{End, Episode, EpisodeBuilder};
 pub use exploration::{Choice, Exploration};
-pub use observation::Observation;
+pub use observation::{Observation, ObservationFault};
 pub use policy::{Policy, Turn};
+pub use seating::Seating;
 pub use streams::{Rng, RunSeed, Stream};
 
 /// One agent's action: an index below [`Dims::n_actions`].

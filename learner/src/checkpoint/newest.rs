@@ -1,13 +1,14 @@
 //! Which checkpoint training goes on from.
 
 use super::{
-    CheckpointError, LATEST, MANIFEST, Manifest, Origin, OtherOrigin, TrainingState, folders, load,
-    load_manifest, written,
+    CheckpointError, MANIFEST, Manifest, Origin, OtherOrigin, TrainingState, folders, load, load_manifest,
+    written,
 };
 use crate::replay_log;
 use rit_algo::Learner;
 use rit_config::{Config, RunDir};
 use rit_episode::{Episode, wire::Expected};
+use rit_policy::place::LATEST;
 use std::path::{Path, PathBuf};
 
 /// A checkpoint that training goes on from.

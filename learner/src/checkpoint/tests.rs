@@ -78,7 +78,13 @@ impl Run {
     }
 
     fn save_and_keep(&self, env_steps: u64, keep: usize) -> PathBuf {
-        let saved = save(&self.run_dir, self.learner.model(), &self.state(env_steps), keep);
+        let saved = save(
+            &self.run_dir,
+            self.learner.model(),
+            &TaskNames::of(&self.config),
+            &self.state(env_steps),
+            keep,
+        );
         self.run_dir.root().join(saved.unwrap())
     }
 

@@ -5,9 +5,9 @@ use crate::{
     evaluation::by_task,
     replay_log::remedy,
     summary::{Ended, Summary},
-    weights_file,
 };
 use rit_config::Config;
+use rit_policy::{TaskNames, weights_file};
 use std::{
     collections::BTreeMap,
     fs,
@@ -113,7 +113,8 @@ impl Trainer {
         let run = self.run_dir.root().file_name().unwrap_or_default().to_string_lossy().into_owned();
         let name = format!("{run}-step-{:012}.safetensors", self.standing.progress.env_steps);
         let path = Path::new(folder).join(name);
-        let weights = weights_file::encode(self.learner.model().layout(), self.learner.params());
+        let weights =
+            weights_file::encode(self.learner.model(), &TaskNames::of(&self.config), self.learner.params());
         let written = weights.map_err(|error| error.to_string()).and_then(|bytes| {
             fs::create_dir_all(folder)
                 .and_then(|()| fs::write(&path, bytes))

@@ -26,6 +26,8 @@ pub struct ValueActing<N: ValueNetwork> {
     stock: Stock,
     /// Of the last step, `[agent rows, A]`.
     utilities: Vec<f32>,
+    /// Of the last step, `[agent rows, h_z]`; empty without.
+    representations: Vec<f32>,
 }
 
 /// After the last step, agents in decision order.
@@ -49,6 +51,7 @@ impl<N: ValueNetwork> ValueActing<N> {
             rows: Rows::default(),
             stock: Stock::default(),
             utilities: Vec::new(),
+            representations: Vec::new(),
         };
         acting.set_params(params);
         acting
@@ -67,6 +70,14 @@ impl<N: ValueNetwork> ValueActing<N> {
 }
 
 impl<N: ValueNetwork> Actor for ValueActing<N> {
+    fn utilities(&self) -> &[f32] {
+        &self.utilities
+    }
+
+    fn task_representations(&self) -> &[f32] {
+        &self.representations
+    }
+
     fn set_params(&mut self, params: &[f32]) {
         assert_eq!(params.len(), self.network.parts().acting.len(), "the parameters that acting needs");
         self.network.parts().layout.derived().extend(params, &mut self.params);
@@ -89,7 +100,8 @@ impl<N: ValueNetwork> Policy for ValueActing<N> {
 
     fn act(&mut self, turns: &mut [Turn<'_>]) {
         let dims = [self.network.parts().memory_dim, self.task_memory_dim()];
-        let Self { network, params, tables, memories, before, rows, stock, utilities } = self;
+        let Self { network, params, tables, memories, before, rows, stock, utilities, representations } =
+            self;
         let (parts, rows, before) = (network.parts(), &mut *rows, &mut *before);
         rows.fill_from_turns(turns);
         before.utility.clear();
@@ -119,6 +131,8 @@ impl<N: ValueNetwork> Policy for ValueActing<N> {
             }
         }
         utilities.clear();
+        representations.clear();
+        representations.extend_from_slice(representation.map_or(&[], |z| tape.slice(z)));
         match head {
             Head::Independent(of_rows) => {
                 choose_at_once(tape.slice(of_rows), rows, parts.n_actions, turns);

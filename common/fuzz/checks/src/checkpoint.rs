@@ -16,9 +16,9 @@ use rit_learner::{
     tensorboard::Position,
     trainer::{TrainError, Trainer, Work},
     weights::Snapshot,
-    weights_file,
     write_queue::write_queue,
 };
+use rit_policy::{TaskNames, place::LATEST, weights_file};
 use serde_json::Value;
 use sha2::{Digest as _, Sha256};
 use std::{
@@ -96,7 +96,8 @@ impl Run {
             log.append(episode)?;
         }
         let origin = Origin::of(&run_dir, &config)?;
-        checkpoint::save(&run_dir, &model, &state(&*learner(&model, &config)?, &config, origin), 1)?;
+        let state = state(&*learner(&model, &config)?, &config, origin);
+        checkpoint::save(&run_dir, &model, &TaskNames::of(&config), &state, 1)?;
         let whole = FILES.map(|name| fs::read(path(&run_dir, name)).unwrap_or_default());
         Ok(Self { _folder: folder, run_dir, config, model, expected, next, whole })
     }
@@ -210,7 +211,7 @@ fn path(run_dir: &RunDir, name: &str) -> PathBuf {
     if name == FILES[FRAMES] {
         return run_dir.replay().join(name);
     }
-    run_dir.checkpoints().join(checkpoint::LATEST).join(Path::new(name))
+    run_dir.checkpoints().join(LATEST).join(Path::new(name))
 }
 
 fn learner(model: &Arc<Model>, config: &Config) -> Result<Box<dyn Learner>, Box<dyn std::error::Error>> {

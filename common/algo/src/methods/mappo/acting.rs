@@ -50,6 +50,10 @@ impl MappoActing {
 }
 
 impl Actor for MappoActing {
+    fn utilities(&self) -> &[f32] {
+        &self.logits
+    }
+
     fn set_params(&mut self, params: &[f32]) {
         assert_eq!(params.len(), self.mappo.acting().len(), "the parameters that acting needs");
         self.params.clear();

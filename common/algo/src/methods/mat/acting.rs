@@ -64,6 +64,10 @@ impl MatActing {
 }
 
 impl Actor for MatActing {
+    fn utilities(&self) -> &[f32] {
+        &self.logits
+    }
+
     fn set_params(&mut self, params: &[f32]) {
         assert_eq!(params.len(), self.mat.acting().len(), "the parameters that acting needs");
         self.params.clear();
