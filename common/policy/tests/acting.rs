@@ -4,7 +4,7 @@
 use rit_algo::{Acting, Method, Model};
 use rit_config::Config;
 use rit_env::{
-    Split,
+    Embedded, Split,
     rollout::{Job, Rollout, all_rolled},
 };
 use rit_episode::{Choice, Episode, Observation, Policy, RunSeed, Stream, Turn};
@@ -50,8 +50,8 @@ fn rolled(config: &Config, weights: &Weights, task: usize, number: u64) -> (Epis
     let acting = Acting::new(&weights.model, &weights.params[weights.model.acting()]);
     let mut watched = Watched { acting, utilities: Vec::new(), representations: Vec::new() };
     let job = Job { number, weights_version: 0, choice: Choice::Greedy, task: Some(task) };
-    let mut rollout =
-        Rollout::new(config.tasks(Split::Training), config.environment_options(), RunSeed(9), true);
+    let worlds = Arc::new(Embedded(config.environment_options()));
+    let mut rollout = Rollout::new(config.tasks(Split::Training), worlds, RunSeed(9), true);
     let episode = all_rolled(rollout.roll(&mut watched, &[job])).unwrap().remove(0);
     (episode, watched)
 }
