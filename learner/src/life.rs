@@ -1,7 +1,7 @@
 //! One life of a run, from a learner's start to its end, and its place for shared memory: a fresh one for each, whose
 //! name nobody guesses, written into the run directory so that actors find it.
 
-use rit_config::RunDir;
+use rit_config::{RunDir, read_text};
 use rit_ipc::{FreshError, RunSpace};
 use std::{
     env, fs, io,
@@ -37,6 +37,11 @@ pub enum LifeError {
 pub fn begin(run_dir: &RunDir) -> Result<(RunSpace, Option<String>), LifeError> {
     remove_dead(run_dir);
     let folders = [env::temp_dir(), "/tmp".into(), "/dev/shm".into()];
+    for folder in &folders {
+        for place in RunSpace::sweep(folder) {
+            tracing::info!(place = %place.display(), "removed what a run that is gone has left in shared memory");
+        }
+    }
     let named = env::var_os("TMPDIR").map_or_else(String::new, |_| "TMPDIR = ".into());
     let wanted = format!("{named}{}", folders[0].display());
     let mut unfit = None;
@@ -63,8 +68,13 @@ pub fn begin(run_dir: &RunDir) -> Result<(RunSpace, Option<String>), LifeError> 
 /// Removes the place that the run directory names, unless its learner lives. For whoever has the run's lock.
 pub fn remove_dead(run_dir: &RunDir) {
     let file = run_dir.shared_memory();
-    let Ok(directory) = fs::read_to_string(&file) else { return };
-    let removed = RunSpace::new(Path::new(directory.trim_end()))
+    let Ok(directory) = read_text(&file) else { return };
+    let place = Path::new(directory.trim_end());
+    if !RunSpace::is_called_fresh(place) {
+        tracing::warn!(file = %file.display(), "it names no place that a learner makes: nothing is removed there");
+        return;
+    }
+    let removed = RunSpace::new(place)
         .map_err(|error| error.to_string())
         .and_then(|space| space.remove_if_dead().map_err(|error| error.to_string()));
     match removed {

@@ -11,10 +11,18 @@ use std::io;
 use std::os::fd::OwnedFd;
 use std::os::unix::fs::{DirBuilderExt as _, MetadataExt as _};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 /// Longest directory and prefix together. iceoryx2 appends a node's number, a port's and a suffix, and panics when
 /// that does not fit into 255 bytes.
 const LENGTH_LIMIT: usize = 100;
+
+/// What a place is called that [`RunSpace::make_fresh`] makes, before its number.
+const FRESH: &str = "rit-";
+
+/// A place is taken for a dead life's only if it is older: between making one and locking it a learner needs
+/// milliseconds.
+const ABANDONED_AFTER: Duration = Duration::from_secs(3600);
 
 /// What iceoryx2 makes in its root.
 const NODES: &str = "nodes";
@@ -152,7 +160,7 @@ impl RunSpace {
             // So few bytes come at once, or not at all.
             rustix::rand::getrandom(&mut name, rustix::rand::GetRandomFlags::empty())
                 .map_err(|error| FreshError::Tell(error.into()))?;
-            let space = Self::new(&folder.join(format!("rit-{:016x}", u64::from_le_bytes(name))))?;
+            let space = Self::new(&folder.join(format!("{FRESH}{:016x}", u64::from_le_bytes(name))))?;
             if !space.leftovers().map_err(|source| space.directory_error(source))?.is_empty() {
                 continue;
             }
@@ -163,6 +171,32 @@ impl RunSpace {
                 Err(error) => return Err(space.directory_error(error).into()),
             }
         }
+    }
+
+    /// Whether a path is called like a place that [`Self::make_fresh`] makes.
+    pub fn is_called_fresh(path: &Path) -> bool {
+        let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+        let is_digit = |byte: u8| byte.is_ascii_digit() || (b'a'..=b'f').contains(&byte);
+        name.strip_prefix(FRESH).is_some_and(|digits| digits.len() == 16 && digits.bytes().all(is_digit))
+    }
+
+    /// Removes the places in this folder that dead lives have left, whatever became of the run directories that told of
+    /// them: those of this user, made more than an hour ago, whose learner's lock nobody holds. Returns which. What
+    /// cannot be looked at or removed stays.
+    pub fn sweep(folder: &Path) -> Vec<PathBuf> {
+        let mut removed = Vec::new();
+        for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
+            let path = entry.path();
+            let age = entry.metadata().and_then(|metadata| metadata.modified());
+            let age = age.ok().and_then(|modified| modified.elapsed().ok());
+            if !Self::is_called_fresh(&path) || age.is_none_or(|age| age < ABANDONED_AFTER) {
+                continue;
+            }
+            if Self::new(&path).is_ok_and(|space| space.remove_if_dead().is_ok_and(|dead| dead)) {
+                removed.push(path);
+            }
+        }
+        removed
     }
 
     /// The directory.
@@ -300,4 +334,48 @@ fn fnv1a(bytes: &[u8]) -> u64 {
     bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, &byte| {
         (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs::{self, File};
+    use std::time::SystemTime;
+
+    /// Makes it look as if nobody had touched it for two hours.
+    fn age(directory: &Path) {
+        let then = SystemTime::now() - 2 * ABANDONED_AFTER;
+        File::open(directory).unwrap().set_modified(then).unwrap();
+    }
+
+    #[test]
+    fn what_dead_lives_have_left_is_swept_and_nothing_else() {
+        let folder = tempfile::tempdir().unwrap();
+        let fresh = || RunSpace::make_fresh(folder.path(), |_| Ok(())).unwrap();
+        let (dead, young, living) = (fresh(), fresh(), fresh());
+        for space in [&dead, &young, &living] {
+            for name in [NODES, SERVICES] {
+                fs::create_dir(space.directory().join(name)).unwrap();
+            }
+            fs::write(space.segment("data"), "frames").unwrap();
+        }
+        let lock = living.lock().unwrap().unwrap();
+        // Of another program, of another kind, and one that others may write to.
+        let others = ["rit-0123", "rit-0123456789ABCDEF", "other", "rit-0123456789abcdef"];
+        for name in others {
+            fs::create_dir(folder.path().join(name)).unwrap();
+        }
+        let open = folder.path().join("rit-0123456789abcdef");
+        fs::set_permissions(&open, std::os::unix::fs::PermissionsExt::from_mode(0o777)).unwrap();
+        let all: Vec<_> = fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().path()).collect();
+        all.iter().filter(|path| *path != young.directory()).for_each(|path| age(path));
+
+        assert_eq!(RunSpace::sweep(folder.path()), [dead.directory()]);
+        assert!(dead.leftovers().unwrap().is_empty());
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), all.len() - 1);
+        drop(lock);
+        assert_eq!(RunSpace::sweep(folder.path()), [living.directory()]);
+        assert!(young.remove_if_dead().unwrap());
+        assert!(RunSpace::sweep(Path::new("/no/such/folder")).is_empty());
+    }
 }
