@@ -15,7 +15,7 @@ mod status;
 
 use crate::{
     evaluation::in_words,
-    gauges::{Happenings, RateWindow, Stopwatch},
+    gauges::{Checkpoints, Happenings, RateWindow, Stopwatch},
     ledger::{ActorId, Counts, Lease, Ledger, Reason},
     receive::Fence,
     summary::Ended,
@@ -26,7 +26,6 @@ use rit_algo::learner::Measure;
 use rit_config::Config;
 use rit_env::FailureKind;
 use rit_episode::Episode;
-use rit_proto::v1;
 use std::{
     collections::{BTreeMap, BTreeSet},
     time::Duration,
@@ -44,6 +43,15 @@ pub const LOOK_EVERY: Duration = Duration::from_millis(250);
 
 /// A look that comes so much later finds that this process itself stood still.
 const LATE_LOOK: Duration = Duration::from_secs(1);
+
+/// Whether the run goes on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum State {
+    Running,
+    Paused,
+    /// It ends.
+    Stopping,
+}
 
 /// An actor that is there.
 #[derive(Debug)]
@@ -95,7 +103,7 @@ pub struct Coordinator {
     ledger: Ledger,
     actors: BTreeMap<ActorId, Actor>,
     next_actor: ActorId,
-    state: v1::RunState,
+    state: State,
     /// The run ends when nothing is under way any more.
     draining: Option<Ended>,
     standing: Standing,
@@ -110,7 +118,7 @@ pub struct Coordinator {
     /// Runs while training has no batch.
     learner_waiting: Stopwatch,
     rates: RateWindow,
-    checkpoints: v1::CheckpointsStatus,
+    checkpoints: Checkpoints,
     /// Whether the last one was not written.
     checkpoints_fail: bool,
     happenings: Happenings,
@@ -136,14 +144,14 @@ impl Coordinator {
             ledger: Ledger::new(config.algorithm.n_rollout_threads, batches, terms),
             actors: BTreeMap::new(),
             next_actor: 0,
-            state: v1::RunState::Running,
+            state: State::Running,
             draining: None,
             frames_refused: BTreeMap::new(),
             frames: 0,
             batches_in_training: 0,
             learner_waiting: Stopwatch::default(),
             rates: RateWindow::default(),
-            checkpoints: v1::CheckpointsStatus::default(),
+            checkpoints: Checkpoints::default(),
             checkpoints_fail: false,
             happenings,
             losses_said: BTreeSet::new(),
@@ -184,7 +192,7 @@ impl Coordinator {
 
     /// Who waits for whom. Nobody does while the run is paused or ending.
     fn time_waits(&mut self) {
-        let (now, running) = (self.now, self.state == v1::RunState::Running);
+        let (now, running) = (self.now, self.state == State::Running);
         self.learner_waiting.set(running && self.batches_in_training == 0, now);
         for (&id, actor) in &mut self.actors {
             actor.waiting.set(running && actor.is_idle(id, &self.ledger), now);
@@ -282,7 +290,7 @@ impl Coordinator {
                 self.hand_out(effects);
             }
             Input::News(News::Warning(what)) => self.warned(what),
-            Input::News(News::Ending) => self.state = v1::RunState::Stopping,
+            Input::News(News::Ending) => self.state = State::Stopping,
             Input::CheckpointEnded(ended) => self.checkpoint_ended(ended),
             Input::Pause => self.pause(),
             Input::Resume => self.resume(effects),
@@ -307,8 +315,7 @@ impl Coordinator {
         }
         let checkpoints = &mut self.checkpoints;
         (checkpoints.written, checkpoints.env_steps) = (checkpoints.written + 1, env_steps);
-        checkpoints.last_s = duration.as_secs_f64();
-        checkpoints.total_s += checkpoints.last_s;
+        (checkpoints.last, checkpoints.total) = (duration, checkpoints.total + duration);
         self.happened(format!("wrote the checkpoint at {env_steps} steps in {} ms", duration.as_millis()));
     }
 
@@ -384,7 +391,7 @@ impl Coordinator {
 
     /// Gives every actor that has nothing to do its share of what may be rolled.
     fn hand_out(&mut self, effects: &mut Vec<Effect>) {
-        if self.state != v1::RunState::Running {
+        if self.state != State::Running {
             return;
         }
         let share = self.config.algorithm.n_rollout_threads.div_ceil(self.actors.len().max(1));
@@ -420,7 +427,7 @@ impl Coordinator {
             return;
         }
         self.over_since = Some(self.now);
-        self.state = v1::RunState::Stopping;
+        self.state = State::Stopping;
         for &id in self.actors.keys() {
             self.ledger.take_back(id, Reason::RunEnded);
             effects.push(Effect::Farewell(id));

@@ -2,7 +2,6 @@
 //! learner's beginning.
 
 use crate::checkpoint::Progress;
-use rit_proto::v1;
 use std::{collections::VecDeque, time::Duration};
 
 /// Rates are taken over so long.
@@ -53,15 +52,15 @@ impl RateWindow {
     }
 
     /// The rates; zero before there are two notes.
-    pub fn rates(&self) -> v1::Rates {
+    pub fn rates(&self) -> Rates {
         let (Some((then, before)), Some((now, after))) = (self.samples.front(), self.samples.back()) else {
-            return v1::Rates::default();
+            return Rates::default();
         };
         let seconds = (*now - *then).as_secs_f64();
         let rate = |before: u64, after: u64| {
             if seconds > 0.0 { after.saturating_sub(before) as f64 / seconds } else { 0.0 }
         };
-        v1::Rates {
+        Rates {
             env_steps_per_s: rate(before.env_steps, after.env_steps),
             episodes_per_s: rate(before.episodes, after.episodes),
             updates_per_s: rate(before.updates, after.updates),
@@ -69,10 +68,49 @@ impl RateWindow {
     }
 }
 
+/// What a run does in a second.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Rates {
+    /// Environment steps collected.
+    pub env_steps_per_s: f64,
+    /// Episodes collected.
+    pub episodes_per_s: f64,
+    /// Updates made.
+    pub updates_per_s: f64,
+}
+
+/// What became of checkpoints since the learner's beginning.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Checkpoints {
+    /// Those written.
+    pub written: u64,
+    /// Those that the disk refused.
+    pub failed: u64,
+    /// What writing took, all together.
+    pub total: Duration,
+    /// What it took the last time.
+    pub last: Duration,
+    /// Environment steps of the newest one written.
+    pub env_steps: u64,
+}
+
+/// Something that happened.
+#[derive(Clone, Debug)]
+pub struct Happening {
+    /// Since the learner's beginning.
+    pub at: Duration,
+    /// Environment steps collected by then.
+    pub env_steps: u64,
+    /// In words.
+    pub what: String,
+    /// Somebody should know of it.
+    pub warning: bool,
+}
+
 /// The last things that happened.
 #[derive(Debug, Default)]
 pub struct Happenings {
-    last: VecDeque<v1::Happening>,
+    last: VecDeque<Happening>,
 }
 
 impl Happenings {
@@ -91,12 +129,12 @@ impl Happenings {
             let oldest = self.last.iter().position(|happening| !happening.warning).unwrap_or(0);
             self.last.remove(oldest);
         }
-        self.last.push_back(v1::Happening { wall_s: now.as_secs_f64(), env_steps, what, warning });
+        self.last.push_back(Happening { at: now, env_steps, what, warning });
     }
 
     /// Oldest first.
-    pub fn list(&self) -> Vec<v1::Happening> {
-        self.last.iter().cloned().collect()
+    pub fn list(&self) -> &VecDeque<Happening> {
+        &self.last
     }
 }
 
@@ -121,17 +159,17 @@ mod tests {
     #[test]
     fn rates_are_those_of_the_last_seconds() {
         let mut window = RateWindow::default();
-        assert_eq!(window.rates(), v1::Rates::default());
+        assert_eq!(window.rates(), Rates::default());
         for s in 0..=30 {
             // A fast beginning that is long past.
             let env_steps = if s < 5 { 1000 * s } else { 5000 + 20 * (s - 5) };
             let progress = Progress { env_steps, episodes: 2 * s, updates: s };
             window.note(Duration::from_secs(s), progress);
             if s == 0 {
-                assert_eq!(window.rates(), v1::Rates::default());
+                assert_eq!(window.rates(), Rates::default());
             }
         }
-        let expected = v1::Rates { env_steps_per_s: 20.0, episodes_per_s: 2.0, updates_per_s: 1.0 };
+        let expected = Rates { env_steps_per_s: 20.0, episodes_per_s: 2.0, updates_per_s: 1.0 };
         assert_eq!(window.rates(), expected);
     }
 
@@ -152,7 +190,7 @@ mod tests {
         (0..50).for_each(|step| happenings.note(Duration::ZERO, step, "an actor joined".into()));
         let list = happenings.list();
         assert_eq!((list.len(), list[0].what.as_str(), list[0].warning), (20, "the disk is full", true));
-        assert!(list[1..].iter().all(|happening| !happening.warning));
+        assert!(list.iter().skip(1).all(|happening| !happening.warning));
         (0..30).for_each(|step| happenings.warn(Duration::ZERO, step, format!("warning {step}")));
         assert_eq!((happenings.list().len(), happenings.list()[0].what.as_str()), (20, "warning 10"));
     }

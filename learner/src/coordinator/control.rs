@@ -1,15 +1,14 @@
 //! What people want of a run: pause, resume, stop, other settings.
 
-use super::{Coordinator, Effect};
+use super::{Coordinator, Effect, State};
 use crate::summary::Ended;
 use rit_config::Config;
-use rit_proto::v1::RunState;
 use std::sync::Arc;
 
 impl Coordinator {
     pub(super) fn pause(&mut self) {
-        if self.state == RunState::Running {
-            self.state = RunState::Paused;
+        if self.state == State::Running {
+            self.state = State::Paused;
             self.stands_still = None;
             tracing::info!("paused");
             self.happened("paused".into());
@@ -17,8 +16,8 @@ impl Coordinator {
     }
 
     pub(super) fn resume(&mut self, effects: &mut Vec<Effect>) {
-        if self.state == RunState::Paused {
-            self.state = RunState::Running;
+        if self.state == State::Paused {
+            self.state = State::Running;
             self.moved_at = self.now;
             tracing::info!("resumed");
             self.happened("resumed".into());
@@ -29,7 +28,7 @@ impl Coordinator {
     pub(super) fn stop(&mut self, drain: bool, ended: Ended, effects: &mut Vec<Effect>) {
         tracing::info!(drain, "asked to stop");
         self.happened("asked to stop".into());
-        self.state = RunState::Stopping;
+        self.state = State::Stopping;
         self.draining = drain.then_some(ended);
         if !drain {
             effects.push(Effect::EndTraining(ended));

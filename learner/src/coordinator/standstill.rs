@@ -1,7 +1,6 @@
 //! A run that should go on and does not says so, and why.
 
-use super::Coordinator;
-use rit_proto::v1::RunState;
+use super::{Coordinator, State};
 use std::time::Duration;
 
 /// Joins without an episode between them that are no accident any more.
@@ -24,7 +23,7 @@ impl Coordinator {
     }
 
     pub(super) fn look_for_standstill(&mut self) {
-        if self.state != RunState::Running || self.stands_still.is_some() {
+        if self.state != State::Running || self.stands_still.is_some() {
             return;
         }
         let still = self.now.saturating_sub(self.moved_at);

@@ -1,9 +1,10 @@
 //! What the coordinator answers when it is asked how the run stands: the one model of what is measured, which gRPC,
 //! terminals and Prometheus show.
 
-use super::{Actor, Coordinator};
+use super::{Actor, Coordinator, State};
 use crate::{
     evaluation::TaskResult,
+    gauges::{Checkpoints, Happening, Rates},
     ledger::{ActorId, Counts},
     trainer::Standing,
 };
@@ -19,7 +20,7 @@ impl Coordinator {
         // All frames of a run have the same length.
         let frame_bytes = size_of::<Header>() + PayloadLayout::new(self.config.dims()).len();
         v1::RunStatus {
-            state: self.state.into(),
+            state: v1::RunState::from(self.state).into(),
             env_steps: progress.env_steps,
             env_steps_max: self.config.training.t_max,
             episodes: progress.episodes,
@@ -37,11 +38,11 @@ impl Coordinator {
             replay_episodes: *replay_episodes as u64,
             pid: std::process::id(),
             replay_episodes_max: self.config.replay_episodes() as u64,
-            rates: Some(self.rates.rates()),
+            rates: Some(self.rates.rates().into()),
             learner_waiting_s: self.learner_waiting.seconds(now),
             shared_memory_bytes: self.frames * frame_bytes as u64,
-            checkpoints: Some(self.checkpoints),
-            happenings: self.happenings.list(),
+            checkpoints: Some(self.checkpoints.into()),
+            happenings: self.happenings.list().iter().map(v1::Happening::from).collect(),
             actors_wanted: self.config.actors.count as u32,
             measures: measured.to_messages(self.measures),
             algorithm: self.config.algorithm.name.to_string(),
@@ -71,5 +72,34 @@ impl Coordinator {
             frames_refused: self.frames_refused.iter().map(|(&name, &count)| (name.into(), count)).collect(),
             imbalances: self.imbalances,
         }
+    }
+}
+
+impl From<State> for v1::RunState {
+    fn from(state: State) -> Self {
+        match state {
+            State::Running => Self::Running,
+            State::Paused => Self::Paused,
+            State::Stopping => Self::Stopping,
+        }
+    }
+}
+
+impl From<Rates> for v1::Rates {
+    fn from(Rates { env_steps_per_s, episodes_per_s, updates_per_s }: Rates) -> Self {
+        Self { env_steps_per_s, episodes_per_s, updates_per_s }
+    }
+}
+
+impl From<Checkpoints> for v1::CheckpointsStatus {
+    fn from(Checkpoints { written, failed, total, last, env_steps }: Checkpoints) -> Self {
+        let (total_s, last_s) = (total.as_secs_f64(), last.as_secs_f64());
+        Self { written, failed, total_s, last_s, env_steps }
+    }
+}
+
+impl From<&Happening> for v1::Happening {
+    fn from(Happening { at, env_steps, what, warning }: &Happening) -> Self {
+        Self { wall_s: at.as_secs_f64(), env_steps: *env_steps, what: what.clone(), warning: *warning }
     }
 }
