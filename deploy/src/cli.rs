@@ -70,13 +70,13 @@ pub struct ConfigOptions {
     #[arg(long, value_name = "NAME")]
     pub algorithm: Option<String>,
     /// The run's seed: the same seed gives the same weights
-    #[arg(long, value_name = "N", value_parser = count)]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = count)]
     pub seed: Option<u64>,
     /// Actor processes
-    #[arg(long, value_name = "N", value_parser = count)]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = count)]
     pub actors: Option<u64>,
     /// Environment steps to collect, `training.t_max`: 1000000, 1_000_000, 1e6 or 1M
-    #[arg(long, value_name = "N", value_parser = count)]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = count)]
     pub steps: Option<u64>,
     /// End at the first evaluation where every training task has reached this, such as win_rate=1.0
     #[arg(long, value_name = "METRIC=VALUE")]
@@ -92,7 +92,7 @@ pub struct ConfigOptions {
 /// How a script tells how a run ended.
 const EXIT_CODES: &str = "\
 Exit codes: 0 finished (all steps are done, or --until is reached), 1 failed, 2 something given was wrong and nothing was \
-overwritten, 3 stopped by `rit ctl stop` or the page, 130 interrupted. summary.json in the run directory says the same, as \
+overwritten, 3 stopped by `rit ctl stop` or the page, 130 interrupted (Ctrl-C, SIGTERM, or SIGHUP where it is not ignored). summary.json in the run directory says the same, as \
 \"ended\".";
 
 #[derive(Args, Debug)]
@@ -228,7 +228,7 @@ pub struct EvaluateOptions {
     #[arg(long, value_parser = within::<u32>(1, EPISODES_MAX.into()))]
     pub episodes: Option<u32>,
     /// Seed of the evaluation; without it one that follows from the run's
-    #[arg(long, value_parser = count)]
+    #[arg(long, allow_negative_numbers = true, value_parser = count)]
     pub seed: Option<u64>,
     /// Print JSON
     #[arg(long)]
@@ -251,7 +251,7 @@ pub struct RenderOptions {
     #[arg(long, default_value_t = 1, value_parser = within::<u8>(1, 20))]
     pub episodes: u8,
     /// Seed of the episodes; without it one that follows from the run's
-    #[arg(long, value_parser = count)]
+    #[arg(long, allow_negative_numbers = true, value_parser = count)]
     pub seed: Option<u64>,
     /// File to write, ending in .gif, .png or .svg
     #[arg(long, value_name = "FILE")]
@@ -279,7 +279,7 @@ pub struct SoakOptions {
     #[arg(long, default_value_t = 2, value_parser = within::<u32>(1, 64))]
     pub actors: u32,
     /// Environment steps of each run; without it the experiment's own number
-    #[arg(long, value_parser = count)]
+    #[arg(long, allow_negative_numbers = true, value_parser = count)]
     pub steps: Option<u64>,
     /// Set any key of both runs; may be given again and again
     #[arg(long = "set", value_name = "KEY=VALUE")]
@@ -484,7 +484,7 @@ pub enum CtlCommand {
         #[arg(long, value_parser = within::<u32>(1, EPISODES_MAX.into()))]
         episodes: Option<u32>,
         /// Seed of the evaluation; without it one that follows from the run's
-        #[arg(long, value_parser = count)]
+        #[arg(long, allow_negative_numbers = true, value_parser = count)]
         seed: Option<u64>,
     },
     /// Write a checkpoint now

@@ -36,12 +36,13 @@ fn words(error: &Error, mut arguments: impl Iterator<Item = String>) -> String {
         ErrorKind::UnknownArgument => {
             let suggested = context(ContextKind::SuggestedArg);
             let suggested = suggested.map(|option| format!("did you mean {option}?"));
-            let advice = match key_meant(&argument, command.as_deref()) {
-                // The very name of a key is no slip of another option's.
-                Some((key, is_its_name)) if is_its_name || suggested.is_none() => {
-                    Some(format!("a key is set with --set {key}=VALUE"))
-                }
-                _ => suggested,
+            let (keys, are_called_so) = keys_meant(&argument, command.as_deref());
+            let settings: Vec<_> = keys.iter().map(|key| format!("--set {key}=VALUE")).collect();
+            // The very name of a key is no slip of another option's.
+            let advice = if !keys.is_empty() && (are_called_so || suggested.is_none()) {
+                Some(format!("a key is set with {}", settings.join(" or ")))
+            } else {
+                suggested
             };
             format!("unknown option {argument}; {}", advice.unwrap_or_else(|| format!("`{help}` lists them")))
         }
@@ -90,15 +91,20 @@ fn option(argument: &str) -> &str {
     argument.split(' ').next().unwrap_or(argument)
 }
 
-/// The key of the configuration that was meant, perhaps, where the command takes any; and whether it is called so.
-fn key_meant(argument: &str, command: Option<&str>) -> Option<(String, bool)> {
+/// The keys of the configuration that were meant, perhaps, where the command takes any; and whether they are called so.
+fn keys_meant(argument: &str, command: Option<&str>) -> (Vec<String>, bool) {
     let root = Cli::command();
-    let takes_keys =
-        root.find_subcommand(command?)?.get_arguments().any(|option| option.get_id() == "settings");
+    let takes_keys = command
+        .and_then(|name| root.find_subcommand(name))
+        .is_some_and(|command| command.get_arguments().any(|option| option.get_id() == "settings"));
+    if !takes_keys {
+        return (Vec::new(), false);
+    }
     let name = option(argument).trim_start_matches('-');
-    let key = rit_config::key_like(name).filter(|_| takes_keys)?;
-    let is_its_name = key.rsplit('.').next() == Some(&name.replace('-', "_"));
-    Some((key, is_its_name))
+    let keys = rit_config::keys_like(name);
+    let is_called_so = |key: &String| key.rsplit('.').next() == Some(&name.replace('-', "_"));
+    let are_called_so = keys.iter().all(is_called_so);
+    (keys, are_called_so)
 }
 
 /// What clap says before it comes to usage and tips, in one line.
@@ -129,6 +135,10 @@ mod tests {
                 &["train", "x", "--batch-size=5"],
                 "unknown option --batch-size; a key is set with --set algorithm.batch_size=VALUE",
             ),
+            (
+                &["train", "x", "--listen", "y"],
+                "unknown option --listen; a key is set with --set learner.listen=VALUE or --set web.listen=VALUE",
+            ),
             (&["plot", "x", "--lr"], "unknown option --lr; `rit plot --help` lists them"),
             (&["train", "x", "--step", "5"], "unknown option --step; did you mean --steps?"),
             (&["train", "x", "--zzz"], "unknown option --zzz; `rit train --help` lists them"),
@@ -142,6 +152,7 @@ mod tests {
                 "--seed \"18446744073709551615\": it is out of range 0..=9223372036854775807",
             ),
             (&["train", "x", "--actors=-1"], "--actors \"-1\": write a whole number of at least 0"),
+            (&["train", "x", "--seed", "-1"], "--seed \"-1\": write a whole number of at least 0"),
             (&["render", "--episodes", "21"], "--episodes \"21\": it is out of range 1..=20"),
             (&["plot", "x", "--out", "y", "--line", "nan"], "--line \"nan\": write a number, such as -12.5"),
             (
@@ -157,6 +168,30 @@ mod tests {
         ] {
             assert_eq!(refused(arguments), message, "{arguments:?}");
         }
+    }
+
+    #[test]
+    fn the_name_of_any_key_is_answered_with_how_it_is_set() {
+        let command = Cli::command();
+        let train = command.find_subcommand("train").unwrap();
+        let options: Vec<_> = train.get_arguments().filter_map(|option| option.get_long()).collect();
+        let mut asked = 0;
+        for key in rit_config::all_keys() {
+            let name = key.rsplit('.').next().unwrap();
+            for name in [name.to_owned(), name.replace('_', "-")] {
+                if options.contains(&name.as_str()) {
+                    continue;
+                }
+                asked += 1;
+                let message = refused(&["train", "matrix-game", &format!("--{name}"), "0.5"]);
+                assert!(
+                    message.starts_with(&format!("unknown option --{name}; a key is set with --set "))
+                        && message.contains(&format!("--set {key}=VALUE")),
+                    "{message}"
+                );
+            }
+        }
+        assert!(asked > 100, "{asked}");
     }
 
     #[test]

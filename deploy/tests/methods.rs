@@ -126,7 +126,7 @@ fn what_does_not_go_with_a_method_is_refused_in_a_line() {
     train(&["--algorithm", "mat", "--set", "algorithm.policy_lag=1"], &["only 0 will do"]);
     train(
         &["--algorithm", "mat", "--set", "network.n_heads=3"],
-        &["hidden_dim 64 is not a multiple of n_heads 3"],
+        &["network.hidden_dim = 64 is not a multiple of network.n_heads = 3"],
     );
     train(
         &["--algorithm", "mappo", "--set", "algorithm.minibatches=64"],

@@ -82,13 +82,13 @@ impl Default for RoleConfig {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ConfigError {
     /// A size of zero.
-    #[error("{name} is 0; it must be at least 1")]
+    #[error("{} is 0; it must be at least 1", shown(name))]
     Zero {
         /// Its name.
         name: &'static str,
     },
     /// Heads that do not split the attention evenly.
-    #[error("{name} {size} is not a multiple of n_heads {n_heads}")]
+    #[error("network.{name} = {size} is not a multiple of network.n_heads = {n_heads}")]
     Heads {
         /// What they split: its name.
         name: &'static str,
@@ -97,6 +97,12 @@ pub enum ConfigError {
         /// Heads.
         n_heads: usize,
     },
+}
+
+/// A size as people set it: those that follow from the tasks have no key.
+fn shown(name: &str) -> String {
+    let of_tasks = ["entity_dim", "n_actions", "agents_max", "entities_max"];
+    if of_tasks.contains(&name) { name.to_owned() } else { format!("network.{name}") }
 }
 
 impl ModelConfig {

@@ -444,7 +444,7 @@ fn a_model_says_which_size_it_cannot_have() {
     };
     assert_eq!(
         config(|config| config.n_heads = 3).unwrap_err(),
-        "hidden_dim 8 is not a multiple of n_heads 3"
+        "network.hidden_dim = 8 is not a multiple of network.n_heads = 3"
     );
     assert_eq!(config(|config| config.n_blocks = 0).unwrap_err(), "n_blocks is 0; it must be at least 1");
     // MAPPO has no heads.

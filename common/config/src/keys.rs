@@ -182,7 +182,7 @@ fn names(defaults: &Table, section: &str) -> String {
 }
 
 /// Every key that takes a value, with its section.
-fn all(defaults: &Table, prefix: &str) -> Vec<String> {
+pub fn all(defaults: &Table, prefix: &str) -> Vec<String> {
     let mut keys = Vec::new();
     for (name, value) in defaults {
         let key = format!("{prefix}{name}");
@@ -192,6 +192,12 @@ fn all(defaults: &Table, prefix: &str) -> Vec<String> {
         }
     }
     keys
+}
+
+/// The keys of this name, in whatever section.
+pub fn called(name: &str, defaults: &Table) -> Vec<String> {
+    let is_called = |key: &String| key.rsplit('.').next() == Some(name);
+    all(defaults, "").into_iter().filter(is_called).collect()
 }
 
 /// The known key that this one is most like, if it is like any. Names are compared and not sections: a key in the

@@ -25,7 +25,7 @@ pub use config::{
 pub use error::ConfigError;
 pub use number::{CountError, WHOLE_MAX, count};
 pub use owned_run_dir::OwnedRunDir;
-pub use regular_file::{TEXT_BYTES_MAX, read_regular, read_text};
-pub use resolve::{is_live, key_like, resolve, set, set_live};
+pub use regular_file::{TEXT_BYTES_MAX, open_regular, read_regular, read_text, write_whole};
+pub use resolve::{all_keys, is_live, keys_like, resolve, set, set_live};
 pub use run_dir::{RunDir, RunDirError};
 pub use run_lock::RunLock;

@@ -93,9 +93,17 @@ pub fn set(assignment: &str) -> Result<Table, ConfigError> {
     Ok(sections.fold(table, |table, section| Table::from_iter([(section.to_owned(), table.into())])))
 }
 
-/// The key that somebody may have meant who wrote this name, such as an option that does not exist.
-pub fn key_like(name: &str) -> Option<String> {
-    keys::closest(name, &defaults().ok()?)
+/// The keys that somebody may have meant who wrote this name, such as an option that does not exist: all that are called
+/// so in their sections, or else the one most like it.
+pub fn keys_like(name: &str) -> Vec<String> {
+    let Ok(defaults) = defaults() else { return Vec::new() };
+    let called = keys::called(&name.replace('-', "_"), &defaults);
+    if called.is_empty() { keys::closest(name, &defaults).into_iter().collect() } else { called }
+}
+
+/// Every key that there is, with its section.
+pub fn all_keys() -> Vec<String> {
+    defaults().map_or_else(|_| Vec::new(), |defaults| keys::all(&defaults, ""))
 }
 
 /// Keys, or sections, that a run may change when it goes on: no weight follows from them.
@@ -392,7 +400,7 @@ mod tests {
                 "environment.view_radius=1",
                 "environment.view_radius means nothing to matrix-game; leave it out",
             ),
-            ("network.n_heads=3", "attention_dim 64 is not a multiple of n_heads 3"),
+            ("network.n_heads=3", "network.attention_dim = 64 is not a multiple of network.n_heads = 3"),
             ("algorithm.mixing=vdn", "algorithm.mixing must be \"network\" or \"sum\""),
             (
                 "environment.spawn_rotate=x",
@@ -448,9 +456,11 @@ mod tests {
         let endless = "gamma".repeat(1_000_000);
         let message = refused(&[&format!("{endless}=1")]);
         assert!(message.len() < 400 && message.contains("gammagamma\"…"), "{message}");
-        assert_eq!(key_like("lr").as_deref(), Some("algorithm.lr"));
-        assert_eq!(key_like("batch-size").as_deref(), Some("algorithm.batch_size"));
-        assert_eq!(key_like("zzz"), None);
+        assert_eq!(keys_like("lr"), ["algorithm.lr"]);
+        assert_eq!(keys_like("batch-size"), ["algorithm.batch_size"]);
+        assert_eq!(keys_like("bach-size"), ["algorithm.batch_size"]);
+        assert_eq!(keys_like("listen"), ["learner.listen", "web.listen"]);
+        assert!(keys_like("zzz").is_empty());
     }
 
     #[test]
