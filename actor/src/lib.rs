@@ -9,4 +9,6 @@ mod run;
 mod sink;
 mod weights;
 
+pub use rollout::RolloutError;
 pub use run::{ActorError, ActorOptions, Learner, run};
+pub use weights::WeightsError;

@@ -7,7 +7,7 @@ use crate::{
     weights::Weights,
 };
 use rit_algo::{ConfigError, Model};
-use rit_config::{Config, RunDir, resolve};
+use rit_config::{Config, RunDir, read_text, resolve};
 use rit_episode::wire::{self, PayloadLayout};
 use rit_ipc::{EpisodeSender, OpenError, RunSpace, RunSpaceError};
 use rit_proto::{
@@ -125,6 +125,11 @@ pub enum ActorError {
 }
 
 impl ActorError {
+    /// Whether another process would end the same way with this learner: what it sends is no weights of the model.
+    pub fn is_permanent(&self) -> bool {
+        matches!(self, Self::Rollout(RolloutError::Weights(error)) if error.is_permanent())
+    }
+
     /// Whether it may be different when the learner is back.
     fn may_pass(&self) -> bool {
         match self {
@@ -267,7 +272,7 @@ impl Actor {
             sink: match &self.learner {
                 Learner::Here(run_dir) => {
                     let path = run_dir.shared_memory();
-                    let place = fs::read_to_string(&path).map_err(|error| gone(&error))?;
+                    let place = read_text(&path).map_err(|error| gone(&error))?;
                     let space = RunSpace::new(Path::new(place.trim_end()))?;
                     let sender = EpisodeSender::open(&space, layout.len(), OPEN_TIMEOUT)?;
                     EpisodeSink::SharedMemory(Box::new(sender))

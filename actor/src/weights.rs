@@ -37,6 +37,12 @@ impl WeightsError {
             Self::Snapshot(_) => false,
         }
     }
+
+    /// Whether the same learner would send the same again: weights of another model, or in another order than this
+    /// build knows.
+    pub fn is_permanent(&self) -> bool {
+        matches!(self, Self::Snapshot(SnapshotError::Length { .. } | SnapshotError::Order { .. }))
+    }
 }
 
 /// What the stream has brought.

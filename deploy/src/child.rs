@@ -1,10 +1,10 @@
 //! How this program starts itself again, as a child process.
 
 use command_fds::{CommandFdExt as _, FdMapping};
-use rit_config::RunLock;
+use rit_config::{RunLock, open_regular};
 use std::{
     fs::{self, DirBuilder, OpenOptions},
-    io,
+    io::{self, ErrorKind},
     os::{
         fd::BorrowedFd,
         unix::{
@@ -44,10 +44,17 @@ pub fn take_name() {
 /// When the system refuses.
 pub fn spawn(mut command: Command, log: &Path, lock: Option<BorrowedFd<'_>>) -> io::Result<Child> {
     if let Some(folder) = log.parent() {
-        // Somebody may have removed it since the run began.
-        DirBuilder::new().recursive(true).mode(0o700).create(folder)?;
+        // Somebody may have removed it since the run began. Where the whole run directory is gone, none is made in its
+        // place.
+        match DirBuilder::new().mode(0o700).create(folder) {
+            Err(error) if error.kind() != ErrorKind::AlreadyExists => {
+                return Err(io::Error::new(error.kind(), format!("{}: {error}", folder.display())));
+            }
+            _ => {}
+        }
     }
-    let log = OpenOptions::new().create(true).append(true).mode(0o600).open(log)?;
+    let log = open_regular(log, OpenOptions::new().create(true).append(true).mode(0o600))
+        .map_err(|error| io::Error::new(error.kind(), format!("{}: {error}", log.display())))?;
     command
         .stdin(Stdio::piped())
         .stdout(Stdio::null())

@@ -23,7 +23,7 @@ pub enum Reached {
 pub async fn reach(run_dir: &RunDir) -> Result<Reached, Failure> {
     match dial(run_dir).await {
         Ok(control) => Ok(Reached::Learner(control)),
-        Err(Silence::Absent(failure)) => match Finished::of(run_dir) {
+        Err(Silence::Absent(failure)) => match Finished::of(run_dir)? {
             Some(finished) => Ok(Reached::Over(Box::new(finished))),
             None => Err(failure),
         },

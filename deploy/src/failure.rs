@@ -13,6 +13,10 @@ use std::{fmt, process::ExitCode};
 /// as `sysexits.h` has it for a failure that passes: the supervisor starts it again.
 pub const UNAVAILABLE: u8 = 75;
 
+/// Exit code of an actor that cannot use what its learner sends, as `sysexits.h` has it for an error of the protocol:
+/// another try would end the same way.
+pub const INCOMPATIBLE: u8 = 76;
+
 /// A failed command.
 #[derive(Debug)]
 pub enum Failure {
@@ -22,6 +26,8 @@ pub enum Failure {
     Runtime(anyhow::Error),
     /// The system refuses what it may grant later: exit code 75.
     Unavailable(anyhow::Error),
+    /// What the learner sends cannot be used, now or later: exit code 76.
+    Incompatible(anyhow::Error),
 }
 
 impl Failure {
@@ -53,6 +59,7 @@ impl Failure {
             Self::Input(_) => 2,
             Self::Runtime(_) => 1,
             Self::Unavailable(_) => UNAVAILABLE,
+            Self::Incompatible(_) => INCOMPATIBLE,
         })
     }
 }
@@ -60,9 +67,10 @@ impl Failure {
 impl fmt::Display for Failure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Input(error) | Self::Runtime(error) | Self::Unavailable(error) => {
-                f.write_str(&in_one_line(error))
-            }
+            Self::Input(error)
+            | Self::Runtime(error)
+            | Self::Unavailable(error)
+            | Self::Incompatible(error) => f.write_str(&in_one_line(error)),
         }
     }
 }
@@ -175,6 +183,7 @@ impl From<ActorError> for Failure {
             | ActorError::Config(_)
             | ActorError::RunId
             | ActorError::Model(_) => Self::input(error),
+            error if error.is_permanent() => Self::Incompatible(error.into()),
             _ => Self::runtime(error),
         }
     }
@@ -209,6 +218,22 @@ mod tests {
         assert_eq!(Failure::input(Outer(inner)).to_string(), format!("run/config.toml: {words}"));
         let failure = Failure::runtime(anyhow::anyhow!("disk\nfull\u{1b}[0m").context("cannot write"));
         assert_eq!(failure.to_string(), "cannot write: disk; full [0m");
+    }
+
+    #[test]
+    fn weights_that_an_actor_cannot_use_have_an_exit_code_of_their_own() {
+        use rit_actor::{RolloutError, WeightsError};
+        use rit_proto::snapshot::SnapshotError;
+        let failure = |error: SnapshotError| {
+            Failure::from(ActorError::Rollout(RolloutError::Weights(WeightsError::Snapshot(error))))
+        };
+        let length = SnapshotError::Length { found: 8, expected: 4 };
+        let order = SnapshotError::Order { version: 7, found: 4, expected: 0 };
+        for error in [length, order] {
+            assert!(matches!(failure(error), Failure::Incompatible(_)));
+        }
+        // A byte may have been turned on the way, and the next try brings it right.
+        assert!(matches!(failure(SnapshotError::Altered(7)), Failure::Runtime(_)));
     }
 
     #[test]

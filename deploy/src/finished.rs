@@ -1,13 +1,13 @@
 //! A run that is over: what its run directory says of it.
 
 use crate::{failure::Failure, report};
-use rit_config::RunDir;
-use rit_learner::metrics::Line;
+use rit_config::{RunDir, TEXT_BYTES_MAX, open_regular, read_regular};
+use rit_learner::{metrics::Line, summary::check_format};
 use rit_policy::place::LATEST;
 use rit_proto::v1::TaskResult;
 use serde_json::{Value, json};
 use std::{
-    fs,
+    fs::{self, OpenOptions},
     io::{BufRead as _, BufReader},
     path::PathBuf,
 };
@@ -27,18 +27,25 @@ impl Finished {
     pub fn read(run_dir: &RunDir) -> Result<Self, Failure> {
         let path = run_dir.summary();
         let named = |what: String| Failure::runtime_message(format!("{}: {what}", path.display()));
-        let text = fs::read(&path).map_err(|error| named(error.to_string()))?;
+        let text = read_regular(&path, TEXT_BYTES_MAX).map_err(|error| named(error.to_string()))?;
         let summary =
             serde_json::from_slice(&text).map_err(|error| named(format!("it was altered: {error}")))?;
+        check_format(&summary).map_err(|error| named(error.to_string()))?;
         Ok(Self { root: run_dir.root().to_owned(), summary })
     }
 
     /// The run's end, if it has come to one that nothing was trained after. Meant for a run without a learner.
-    pub fn of(run_dir: &RunDir) -> Option<Self> {
-        let finished = Self::read(run_dir).ok()?;
+    ///
+    /// # Errors
+    /// When the summary that is there cannot be read.
+    pub fn of(run_dir: &RunDir) -> Result<Option<Self>, Failure> {
+        if !run_dir.summary().exists() {
+            return Ok(None);
+        }
+        let finished = Self::read(run_dir)?;
         let newest = fs::read_link(run_dir.checkpoints().join(LATEST)).ok();
         let trained = newest.and_then(|newest| newest.to_str()?.rsplit('-').next()?.parse::<u64>().ok());
-        (trained.unwrap_or(0) <= finished.number("env_steps")).then_some(finished)
+        Ok((trained.unwrap_or(0) <= finished.number("env_steps")).then_some(finished))
     }
 
     /// For people; a run that did not finish says first how it ended.
@@ -133,7 +140,7 @@ impl Finished {
 /// When the file cannot be read.
 pub fn metrics(run_dir: &RunDir, from_env_steps: u64) -> Result<impl Iterator<Item = Line>, Failure> {
     let path = run_dir.metrics();
-    let file = fs::File::open(&path)
+    let file = open_regular(&path, OpenOptions::new().read(true))
         .map_err(|error| Failure::runtime_message(format!("{}: {error}", path.display())))?;
     let lines = BufReader::new(file).split(b'\n').map_while(Result::ok);
     let lines = lines.filter_map(|line| serde_json::from_slice::<Line>(&line).ok());

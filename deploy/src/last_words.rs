@@ -1,7 +1,8 @@
 //! What a process that ended said last: why it ended, if its log tells.
 
+use rit_config::open_regular;
 use std::{
-    fs::File,
+    fs::OpenOptions,
     io::{Read as _, Seek as _, SeekFrom},
     path::Path,
 };
@@ -13,7 +14,7 @@ const TAIL: u64 = 64 << 10;
 /// lies before is of others.
 pub fn last_words(log: &Path, begins_at: u64) -> String {
     let mut bytes = Vec::new();
-    let read = File::open(log).and_then(|mut file| {
+    let read = open_regular(log, OpenOptions::new().read(true)).and_then(|mut file| {
         let from = file.metadata()?.len().saturating_sub(TAIL).max(begins_at);
         file.seek(SeekFrom::Start(from))?;
         file.take(TAIL).read_to_end(&mut bytes)

@@ -2,6 +2,7 @@
 
 use crate::failure::Failure;
 use clap::{Args, ValueEnum};
+use rit_config::open_regular;
 use rit_learner::run_handle::SetLog;
 use std::{
     fs::OpenOptions,
@@ -84,7 +85,7 @@ impl LogOptions {
     /// # Errors
     /// When the filter means nothing.
     pub fn start_in(&self, path: &Path, process: &str) -> Result<tracing::Span, Failure> {
-        let writer = match OpenOptions::new().create(true).append(true).open(path) {
+        let writer = match open_regular(path, OpenOptions::new().create(true).append(true)) {
             Ok(file) => BoxMakeWriter::new(Mutex::new(file)),
             Err(_) => BoxMakeWriter::new(io::sink),
         };

@@ -124,6 +124,12 @@ pub fn reasons(counts: &HashMap<String, u64>) -> Option<String> {
     (!sorted.is_empty()).then(|| words.collect::<Vec<_>>().join(", "))
 }
 
+/// So many of these: `1 actor`, `2 actors`.
+pub fn counted(number: u64, noun: &str) -> String {
+    let plural = if number == 1 { "" } else { "s" };
+    format!("{} {noun}{plural}", grouped(number))
+}
+
 /// A number with thin groups of three digits.
 pub fn grouped(number: u64) -> String {
     let digits = number.to_string();

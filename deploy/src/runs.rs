@@ -97,20 +97,23 @@ impl Row {
                     .push(tasks.into_values().map(|result| (result.mean_return, result.win_rate)).collect());
             }
         }
-        let finished = if run_dir.is_in_use() { None } else { Finished::of(&run_dir) };
+        let finished = if run_dir.is_in_use() { Ok(None) } else { Finished::of(&run_dir) };
         let state = match &finished {
             _ if run_dir.is_in_use() => "running",
-            Some(finished) => finished.ended(),
-            None => "broken off",
+            Ok(Some(finished)) => finished.ended(),
+            Ok(None) => "broken off",
+            Err(_) => "unreadable",
         };
+        let (state, reason) = (state.to_owned(), finished.as_ref().err().map(ToString::to_string));
+        let finished = finished.ok().flatten();
         let (metric, values) = measured(&evaluations);
         Self {
             run,
             task_set: Some(config.environment.task_set.to_string()),
             algorithm: Some(config.algorithm.name.to_string()),
             seed: Some(config.seed.0),
-            state: state.to_owned(),
-            reason: None,
+            state,
+            reason,
             env_steps: finished.as_ref().map_or(env_steps, Finished::env_steps),
             t_max: Some(config.training.t_max),
             metric,

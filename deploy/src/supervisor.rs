@@ -12,7 +12,10 @@ mod shell;
 #[cfg(test)]
 mod tests;
 
-use crate::failure::UNAVAILABLE;
+use crate::{
+    failure::{INCOMPATIBLE, UNAVAILABLE},
+    report::counted,
+};
 use restarts::{DEATHS_MAX, Restarts};
 use rit_learner::summary::Ended;
 use std::{collections::BTreeMap, time::Duration};
@@ -24,8 +27,12 @@ pub use shell::watch_over;
 const STOPPED: i32 = Ended::Stopped.exit_code() as i32;
 const INTERRUPTED: i32 = Ended::Interrupted.exit_code() as i32;
 
-/// How long a learner may take to answer.
-const START_TIMEOUT: Duration = Duration::from_secs(30);
+/// How long a learner may take to answer: one with a large network or a large replay to read back, on a busy machine,
+/// needs minutes.
+const START_TIMEOUT: Duration = Duration::from_secs(600);
+
+/// When somebody is told that it has not answered yet; and how long one is waited for whose run shall end.
+const SLOW_START: Duration = Duration::from_secs(30);
 
 /// How long processes may take to end once asked, before they are killed.
 const END_TIMEOUT: Duration = Duration::from_secs(10);
@@ -38,6 +45,10 @@ const SILENT_ASKS_MIN: u32 = 5;
 
 /// From the moment that an actor has left, unasked, to the start of another.
 const LEFT_DELAY: Duration = Duration::from_millis(500);
+
+fn wanted_in_words(actors: u32) -> String {
+    format!("{} {} wanted", counted(actors.into(), "actor"), if actors == 1 { "is" } else { "are" })
+}
 
 /// The process of one place.
 #[derive(Debug, Default)]
@@ -104,10 +115,16 @@ enum Phase {
 /// How reachable the learner is.
 #[derive(Debug)]
 enum Contact {
-    /// It has not answered since it was started at this moment; why it was not reached last.
-    Starting(Duration, String),
+    /// It has not answered since it was started at this moment; why it was not reached last, and whether that was said.
+    Starting { since: Duration, why: String, slow: bool },
     /// It answered last at this moment, and was asked in vain so often since.
     Answering(Duration, u32),
+}
+
+impl Contact {
+    fn starting(since: Duration) -> Self {
+        Self::Starting { since, why: String::new(), slow: false }
+    }
 }
 
 /// The supervisor.
@@ -134,7 +151,7 @@ impl Supervisor {
         Self {
             phase: Phase::Running,
             learner: Process::default(),
-            contact: Contact::Starting(Duration::ZERO, String::new()),
+            contact: Contact::starting(Duration::ZERO),
             actors: BTreeMap::new(),
             wanted: actors,
             begun: false,
@@ -152,8 +169,9 @@ impl Supervisor {
     /// When [`Event::Tick`] is due next, if ever.
     pub fn deadline(&self) -> Option<Duration> {
         let start = match (&self.phase, &self.contact) {
-            (Phase::Running, Contact::Starting(since, _)) if self.learner.is_up() => {
-                Some(*since + START_TIMEOUT)
+            (Phase::Running, Contact::Starting { since, slow, .. }) if self.learner.is_up() => {
+                let said = *slow && !self.interrupted;
+                Some(*since + if said { START_TIMEOUT } else { SLOW_START })
             }
             _ => None,
         };
@@ -201,7 +219,7 @@ impl Supervisor {
         process.state = State::Up(Up::default());
         process.restarts.started(now);
         if place == Place::Learner {
-            (self.contact, self.run_ends) = (Contact::Starting(now, String::new()), false);
+            (self.contact, self.run_ends) = (Contact::starting(now), false);
         }
         effects.push(Effect::Start(place));
     }
@@ -241,7 +259,7 @@ impl Supervisor {
             let before = effects.len();
             self.ask_to_end(Place::Actor(slot), None, effects);
             if effects.len() > before {
-                let say = format!("{wanted} actors are wanted: {} leaves", Place::Actor(slot));
+                let say = format!("{}: {} leaves", wanted_in_words(wanted), Place::Actor(slot));
                 effects.push(Effect::Say(say));
             }
         }
@@ -280,7 +298,7 @@ impl Supervisor {
             return;
         }
         if standing.actors_wanted > self.wanted {
-            effects.push(Effect::Say(format!("{} actors are wanted", standing.actors_wanted)));
+            effects.push(Effect::Say(wanted_in_words(standing.actors_wanted)));
         }
         self.wanted = standing.actors_wanted;
         self.adjust_actors(now, effects);
@@ -288,7 +306,7 @@ impl Supervisor {
 
     fn no_answer(&mut self, why: String, now: Duration, effects: &mut Vec<Effect>) {
         match &mut self.contact {
-            Contact::Starting(_, last) => *last = why,
+            Contact::Starting { why: last, .. } => *last = why,
             Contact::Answering(since, asks) => {
                 *asks += 1;
                 let silent = now.saturating_sub(*since);
@@ -318,7 +336,7 @@ impl Supervisor {
                 effects.push(Effect::StopRun);
             }
             // One that has not answered yet is asked when it does.
-            (Phase::Running, Contact::Starting(..)) if self.learner.is_up() => {}
+            (Phase::Running, Contact::Starting { .. }) if self.learner.is_up() => {}
             _ => self.end(Outcome::Interrupted, now, effects),
         }
     }
@@ -332,7 +350,7 @@ impl Supervisor {
         }
         let log = format!("{}/learner.log", self.logs);
         let died = format!("the learner {exit}: {last_words} (log: {log})");
-        self.contact = Contact::Starting(now, String::new());
+        self.contact = Contact::starting(now);
         match exit {
             // It has ended the run in order, and its summary says how.
             Exit::Code(0 | STOPPED) if !self.interrupted => self.end(Outcome::Finished, now, effects),
@@ -386,6 +404,9 @@ impl Supervisor {
         } else if *exit == Exit::Code(2) {
             // What was given is wrong, and will be the second time.
             self.fail(true, format!("{}: {last_words}", Place::Actor(slot)), now, effects);
+        } else if *exit == Exit::Code(INCOMPATIBLE.into()) {
+            // Nor would the next one understand this learner.
+            self.fail(false, format!("{}: {last_words}", Place::Actor(slot)), now, effects);
         } else {
             self.restart(Place::Actor(slot), exit, last_words, now, effects);
         }
@@ -485,21 +506,36 @@ impl Supervisor {
                 _ => {}
             }
         }
-        let late = match &self.contact {
-            Contact::Starting(since, why) if now.saturating_sub(*since) >= START_TIMEOUT => Some(why.clone()),
-            _ => None,
-        };
-        if let Some(why) = late.filter(|_| self.learner.is_up() && matches!(self.phase, Phase::Running)) {
-            let seconds = START_TIMEOUT.as_secs();
-            let message = format!(
-                "the learner does not answer after {seconds} s: {why} (log: {}/learner.log)",
-                self.logs
-            );
-            if self.begun && !self.interrupted {
-                self.begin_anew(&message, &why, now, effects);
+        self.look_at_start(now, effects);
+    }
+
+    /// A learner that takes long to begin is waited for with a word; one that takes too long is given up.
+    fn look_at_start(&mut self, now: Duration, effects: &mut Vec<Effect>) {
+        if !self.learner.is_up() || !matches!(self.phase, Phase::Running) {
+            return;
+        }
+        let logs = &self.logs;
+        let Contact::Starting { since, why, slow } = &mut self.contact else { return };
+        let waited = now.saturating_sub(*since);
+        let why = if why.is_empty() { String::new() } else { format!(": {why}") };
+        let log = format!("(log: {logs}/learner.log)");
+        if self.interrupted && waited >= SLOW_START {
+            return self.end(Outcome::Interrupted, now, effects);
+        }
+        if waited >= START_TIMEOUT {
+            let message =
+                format!("the learner does not answer after {} s{why} {log}", START_TIMEOUT.as_secs());
+            return if self.begun {
+                self.begin_anew(&message, &message, now, effects);
             } else {
                 self.fail(false, message, now, effects);
-            }
+            };
+        }
+        if waited >= SLOW_START && !std::mem::replace(slow, true) {
+            let (slow, limit) = (SLOW_START.as_secs(), START_TIMEOUT.as_secs());
+            effects.push(Effect::Say(format!(
+                "the learner has not answered for {slow} s{why}; it is waited for up to {limit} s {log}"
+            )));
         }
     }
 }

@@ -9,6 +9,7 @@ use crate::{
     logging::LogOptions,
     output::{self, Reader},
     progress::Progress,
+    report,
     supervisor::{Outcome, watch_over},
 };
 use rit_config::{Config, OwnedRunDir, RunDir};
@@ -109,7 +110,8 @@ fn prepare(options: &ConfigOptions) -> Result<Prepared, Failure> {
         (None, None) => return Err(Failure::input_message("which experiment? `rit experiments` lists them")),
     };
     let root = owned.run_dir().root().display();
-    let mut said = vec![format!("{name}: learner and {} actors, run directory {root}", config.actors.count)];
+    let actors = report::counted(config.actors.count as u64, "actor");
+    let mut said = vec![format!("{name}: learner and {actors}, run directory {root}")];
     if let Some(beginning) = beginning {
         if let Err(failure) = beginning.write(owned.run_dir()) {
             owned.undo()?;

@@ -1,6 +1,7 @@
 //! What a learner says that somebody should know of, each once.
 
 use rit_proto::v1::RunStatus;
+use std::collections::BTreeSet;
 
 /// Which warnings are known already.
 #[derive(Debug, Default)]
@@ -9,6 +10,8 @@ pub struct Warnings {
     learner: u32,
     /// Seconds since it began.
     known_until_s: f64,
+    /// All that were said.
+    said: BTreeSet<String>,
 }
 
 impl Warnings {
@@ -20,7 +23,15 @@ impl Warnings {
         let known = self.known_until_s;
         let new = status.happenings.iter().filter(|happening| happening.wall_s > known);
         self.known_until_s = new.clone().map(|happening| happening.wall_s).fold(known, f64::max);
-        new.filter(|happening| happening.warning).map(|happening| happening.what.clone()).collect()
+        let new: Vec<_> =
+            new.filter(|happening| happening.warning).map(|happening| happening.what.clone()).collect();
+        self.said.extend(new.iter().cloned());
+        new
+    }
+
+    /// Those of a run that is over that were never said: its learner may have ended before it was asked how it stands.
+    pub fn left_of(&mut self, warnings: Vec<String>) -> Vec<String> {
+        warnings.into_iter().filter(|what| self.said.insert(what.clone())).collect()
     }
 }
 
@@ -40,5 +51,6 @@ mod tests {
         assert_eq!(warnings.new_of(&status(7, vec![a.clone(), b, c])), ["c"]);
         assert!(warnings.new_of(&status(7, vec![a.clone()])).is_empty());
         assert_eq!(warnings.new_of(&status(8, vec![a])), ["a"]);
+        assert_eq!(warnings.left_of(vec!["a".into(), "d".into(), "d".into()]), ["d"]);
     }
 }

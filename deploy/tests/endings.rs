@@ -3,10 +3,13 @@
 
 mod common;
 
-use common::{RunFolder, Train, actor_pid, kill, learner_pid, output, rit, wait_until_gone};
+use common::{RunFolder, Train, actor_pid, kill, learner_pid, output, refused, rit, wait_until_gone};
 use rustix::process::Signal;
 use serde_json::Value;
-use std::{fs, process::Stdio};
+use std::{
+    fs,
+    process::{Command, Stdio},
+};
 
 const RUN: &[&str] = &[
     "matrix-game",
@@ -63,6 +66,71 @@ fn a_run_that_was_asked_to_end_says_by_whom() {
     let status = output(&["ctl", "--run", folder.run_dir().to_str().unwrap(), "status"]);
     let status = String::from_utf8(status.stdout).unwrap();
     assert!(status.starts_with("the run is over: interrupted"), "{status}");
+}
+
+#[test]
+fn a_terminal_that_closes_ends_a_run_in_order_and_nohup_keeps_it() {
+    let folder = RunFolder::new();
+    let mut train = under_way(&folder, &[]);
+    let learner = learner_pid(&train.wait_for("the learner", |_| true));
+    train.signal(Signal::HUP);
+    assert_eq!(train.end_with(130)["ended"], "interrupted");
+    assert_eq!(summary(&folder)["ended"], "interrupted");
+    wait_until_gone(learner);
+
+    let folder = RunFolder::new();
+    let mut command = Command::new("nohup");
+    command.arg(env!("CARGO_BIN_EXE_rit")).stdin(Stdio::null());
+    let mut train = folder.start_as(command, &[&["--json"], RUN].concat());
+    let before = train.wait_for("training", |status| status["updates"].as_u64() > Some(20));
+    train.signal(Signal::HUP);
+    kill(learner_pid(&before), Signal::HUP);
+    let after = train.wait_for("further training", |status| {
+        status["updates"].as_u64() > before["updates"].as_u64().map(|updates| updates + 50)
+    });
+    assert_eq!(learner_pid(&after), learner_pid(&before), "children ignore it too");
+    train.signal(Signal::TERM);
+    assert_eq!(train.wait().status.code(), Some(130));
+}
+
+#[test]
+fn a_run_whose_directory_is_removed_says_so_before_it_ends() {
+    let folder = RunFolder::new();
+    let mut train = folder.start_as(rit(&[]), RUN);
+    train.wait_for("training", |status| status["updates"].as_u64() > Some(20));
+    let elsewhere = folder.path().join("elsewhere");
+    fs::rename(folder.run_dir(), &elsewhere).unwrap();
+    let log = elsewhere.join("logs/train.log");
+    while !fs::read_to_string(&log).unwrap().contains("is gone, removed or renamed") {
+        std::thread::yield_now();
+    }
+    // Back in its place, all is well.
+    fs::rename(&elsewhere, folder.run_dir()).unwrap();
+    train.signal(Signal::TERM);
+    assert_eq!(train.wait().status.code(), Some(130));
+    assert_eq!(summary(&folder)["ended"], "interrupted");
+}
+
+#[test]
+fn a_run_that_ended_in_order_never_begins_anew() {
+    let folder = RunFolder::new();
+    folder.train(&[RUN, &["--steps", "100"]].concat());
+    let run_dir = folder.run_dir();
+    fs::remove_dir_all(run_dir.join("checkpoints")).unwrap();
+    fs::remove_file(run_dir.join("checkpoints.json")).unwrap();
+    let metrics = fs::read(run_dir.join("metrics.jsonl")).unwrap();
+    let run = run_dir.to_str().unwrap();
+    refused(
+        &["train", "--resume", run, "--steps", "200"],
+        &["holds no checkpoint", "summary.json tells of it"],
+    );
+    assert_eq!(fs::read(run_dir.join("metrics.jsonl")).unwrap(), metrics);
+
+    // One that was killed before its first checkpoint has nothing else to do, and says it.
+    fs::remove_file(run_dir.join("summary.json")).unwrap();
+    Train::resume(&folder, &["--steps", "200"]).finish();
+    let said = fs::read_to_string(run_dir.join("logs/train.log")).unwrap();
+    assert!(said.contains("no checkpoint was written yet: training begins again at step 0"), "{said}");
 }
 
 /// Waiting for room on a disk is of no use where the directory itself was removed.

@@ -276,6 +276,12 @@ fn torn_metrics_are_repaired_at_the_last_whole_line_and_it_is_said() {
         .filter(|line| (&line["kind"], &line["env_steps"]) != (&lost["kind"], &lost["env_steps"]));
     assert!(metrics(&folder).iter().eq(kept), "every other line is there once");
     assert_eq!(tensorboard_events(&folder), undisturbed.len() - 1);
+
+    // Nor is it silent where nothing is left to be done, and the learner ends before anybody asks it.
+    fs::write(&path, "").unwrap();
+    let resumed = output(&["train", "--resume", run_dir.to_str().unwrap()]);
+    let stderr = String::from_utf8_lossy(&resumed.stderr);
+    assert!(resumed.status.success() && stderr.contains("lines are missing"), "{stderr}");
 }
 
 /// What was done to a run directory after it was trained in, and what is said of it; nothing is trained anew.

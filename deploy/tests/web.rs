@@ -521,5 +521,8 @@ async fn a_browser_shows_the_run_and_steers_it() {
     browser.click("stop").await;
     browser.click("stop-confirm").await;
     browser.wait_for_state("ended").await;
+    let script = "return [...document.querySelectorAll('#processes .pill')].map((pill) => pill.textContent)";
+    let states = browser.js(script).await;
+    assert!(states.as_array().unwrap().iter().all(|state| state == "ended"), "{states}");
     train.finish_stopped();
 }

@@ -42,7 +42,7 @@ use rit_policy::{
 use safetensors::{Dtype, SafeTensorError, SafeTensors, tensor::TensorView};
 use sha2::{Digest as _, Sha256};
 use std::{
-    fs::{self, File},
+    fs::{self, File, OpenOptions},
     io::{self, Write as _},
     os::unix::fs::symlink,
     path::{Path, PathBuf},
@@ -225,7 +225,9 @@ fn write_folder(
 }
 
 fn write(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
-    let written = File::create(path).and_then(|mut file| {
+    let mut options = OpenOptions::new();
+    let opened = rit_config::open_regular(path, options.write(true).create(true).truncate(true));
+    let written = opened.and_then(|mut file| {
         file.write_all(bytes)?;
         file.sync_all()
     });

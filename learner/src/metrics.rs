@@ -8,12 +8,13 @@ use crate::{
     measured::Measured,
     metrics_repair::{End, Header, MetricsError, is_header, repair},
 };
+use rit_config::open_regular;
 use rit_episode::Episode;
 use rit_proto::v1;
 use serde::{Deserialize, Serialize};
 use std::{
     collections::{BTreeMap, VecDeque},
-    fs::{File, OpenOptions},
+    fs::OpenOptions,
     io::{self, Read as _, Seek as _, SeekFrom},
     path::{Path, PathBuf},
     time::Instant,
@@ -186,7 +187,8 @@ impl MetricsFile {
         before_s: f64,
     ) -> Result<(Self, Option<String>), MetricsError> {
         let (len, warning) = end.map_or(Ok((0, None)), |end| repair(path, header, end))?;
-        let file = OpenOptions::new().create(true).truncate(false).write(true).open(path)?;
+        let mut options = OpenOptions::new();
+        let file = open_regular(path, options.create(true).truncate(false).write(true))?;
         let mut file = AppendFile::new(path.to_owned(), file, len)?;
         if len == 0 {
             file.append(&header.line()?);
@@ -255,7 +257,7 @@ impl Follower {
     /// When the file cannot be read or holds something else.
     pub fn read(&mut self) -> io::Result<Vec<Line>> {
         let len = *self.len.borrow_and_update();
-        let mut file = File::open(&self.path)?;
+        let mut file = open_regular(&self.path, OpenOptions::new().read(true))?;
         file.seek(SeekFrom::Start(self.at))?;
         let mut text = Vec::new();
         file.take(CHUNK.min(len.saturating_sub(self.at))).read_to_end(&mut text)?;

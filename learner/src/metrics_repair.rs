@@ -1,11 +1,12 @@
 //! What a learner finds of `metrics.jsonl` when it goes on: lines that are whole are kept, and what is not is said.
 
-use rit_config::RunDir;
+use rit_config::{RunDir, open_regular};
 use serde::{Deserialize, Serialize};
 use std::{
-    fs::{self, File, OpenOptions},
+    fs::{self, OpenOptions},
     io::{self, BufRead as _, BufReader, Seek as _, SeekFrom, Write as _},
     ops::Range,
+    os::unix::fs::OpenOptionsExt as _,
     path::{Path, PathBuf},
 };
 
@@ -117,7 +118,7 @@ impl Lines {
 
     /// Reads lines until one is beyond the end: that, and what follows it, was written by a learner that died.
     fn read(path: &Path, header: &Header, until_env_steps: u64) -> Result<Self, MetricsError> {
-        let mut reader = BufReader::new(File::open(path)?);
+        let mut reader = BufReader::new(open_regular(path, OpenOptions::new().read(true))?);
         let (mut lines, mut line, mut at) = (Self::default(), Vec::new(), 0);
         // Broken lines behind the last whole one are no hole among them.
         let mut broken_since = 0;
@@ -167,9 +168,6 @@ pub fn repair(path: &Path, header: &Header, end: End) -> Result<(u64, Option<Str
             Some(format!("{} is gone: a new one begins at {} steps", path.display(), end.env_steps)),
         ));
     }
-    if !fs::metadata(path)?.is_file() {
-        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is no regular file").into());
-    }
     let mut lines = Lines::read(path, header, end.env_steps)?;
     // The header and the first line behind it are one range.
     lines.whole.dedup_by(|next, last| {
@@ -189,7 +187,7 @@ pub fn repair(path: &Path, header: &Header, end: End) -> Result<(u64, Option<Str
         );
         return Ok((len, Some(warning)));
     }
-    let file = OpenOptions::new().write(true).open(path)?;
+    let file = open_regular(path, OpenOptions::new().write(true))?;
     file.set_len(len)?;
     let warning = (len != end.len).then(|| {
         format!(
@@ -208,7 +206,9 @@ fn rewrite(path: &Path, ranges: &[Range<u64>]) -> io::Result<PathBuf> {
     let damaged = places.find(|place| fs::symlink_metadata(place).is_err());
     let damaged = damaged.ok_or_else(|| io::Error::other("there are 99 damaged ones beside it already"))?;
     let partial = path.with_extension("jsonl.partial");
-    let (mut from, mut to) = (File::open(path)?, File::create(&partial)?);
+    let mut options = OpenOptions::new();
+    let mut to = open_regular(&partial, options.write(true).create(true).truncate(true).mode(0o600))?;
+    let mut from = open_regular(path, OpenOptions::new().read(true))?;
     for range in ranges {
         from.seek(SeekFrom::Start(range.start))?;
         io::copy(&mut io::Read::take(&mut from, range.end - range.start), &mut to)?;

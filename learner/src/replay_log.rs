@@ -4,6 +4,7 @@
 //! number. A checkpoint after N episodes needs the last `buffer_size` frames before N to be durable; what lies
 //! behind N was written by a learner that died, and is cut off.
 
+use rit_config::open_regular;
 use rit_episode::{
     Episode,
     wire::{self, EncodeError, Expected, Frame, Header, PayloadLayout, Rejection, RunId},
@@ -98,7 +99,7 @@ impl ReplayLog {
             let cut = if frames == 0 {
                 fs::remove_file(&path)
             } else {
-                OpenOptions::new().write(true).open(&path).and_then(|file| {
+                open_regular(&path, OpenOptions::new().write(true)).and_then(|file| {
                     let keep = frames * log.frame_len();
                     if file.metadata()?.len() > keep { file.set_len(keep) } else { Ok(()) }
                 })
@@ -130,8 +131,9 @@ impl ReplayLog {
         let mut file = match self.file.take() {
             Some(file) => file,
             None => {
-                let opened = OpenOptions::new().create(true).truncate(false).write(true).open(&path);
-                let mut file = opened.map_err(io)?;
+                let mut options = OpenOptions::new();
+                options.create(true).truncate(false).write(true);
+                let mut file = open_regular(&path, &mut options).map_err(io)?;
                 file.seek(SeekFrom::Start(begin)).map_err(io)?;
                 file
             }
@@ -207,7 +209,7 @@ pub fn read(folder: &Path, expected: &Expected, numbers: Range<u64>) -> Result<V
             Some(open) if at > 0 => open,
             file => {
                 let path = path(folder, number - at);
-                let opened = File::open(&path).and_then(|mut file| {
+                let opened = open_regular(&path, OpenOptions::new().read(true)).and_then(|mut file| {
                     file.seek(SeekFrom::Start(at * frame_len(&expected.layout)))?;
                     Ok(io::BufReader::with_capacity(1 << 20, file))
                 });
@@ -235,7 +237,8 @@ pub fn read(folder: &Path, expected: &Expected, numbers: Range<u64>) -> Result<V
 /// begins with the file whatever its length.
 fn refuse_other_layouts(path: &Path, number: u64) -> Result<(), ReplayLogError> {
     let mut header: Header = bytemuck::Zeroable::zeroed();
-    let first = File::open(path).and_then(|mut file| file.read_exact(bytemuck::bytes_of_mut(&mut header)));
+    let first = open_regular(path, OpenOptions::new().read(true))
+        .and_then(|mut file| file.read_exact(bytemuck::bytes_of_mut(&mut header)));
     // A file too short, or one that begins with an empty place, is for the reader to find.
     if first.is_ok() && header.magic == wire::MAGIC && header.layout_version != wire::LAYOUT_VERSION {
         let rejection = Rejection::LayoutVersion { found: header.layout_version };

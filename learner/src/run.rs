@@ -19,7 +19,7 @@ use crate::{
     writer::Writer,
 };
 use rit_algo::{ConfigError, Learner, Model};
-use rit_config::{Config, RunDir, Tls};
+use rit_config::{Config, RunDir, Tls, write_whole};
 use rit_env::Split;
 use rit_episode::wire::{Expected, PayloadLayout};
 use rit_ipc::{CreateError, EpisodeReceiver, Limits, ReceiveError};
@@ -333,7 +333,6 @@ fn tell_address(run_dir: &RunDir, address: &Address) -> Result<(), LearnerError>
         Address::Unix(_) => run_dir.address(),
         Address::Tcp { .. } => run_dir.remote_address(),
     };
-    let partial = path.with_extension("partial");
-    let written = fs::write(&partial, format!("{address}\n")).and_then(|()| fs::rename(&partial, &path));
+    let written = write_whole(&path, format!("{address}\n").as_bytes());
     written.map_err(|error| LearnerError::Io { what: path.display().to_string(), error })
 }

@@ -5,8 +5,9 @@ use crate::{
     checkpoint::{self, Progress},
     evaluation::TaskResult,
 };
-use rit_config::RunDir;
+use rit_config::{RunDir, TEXT_BYTES_MAX, read_regular, write_whole};
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 use std::{
     collections::BTreeMap,
     fmt, fs,
@@ -23,7 +24,7 @@ pub enum Ended {
     Until,
     /// Somebody asked it to stop: `rit ctl stop`, or the page.
     Stopped,
-    /// A signal or Ctrl-C asked it to end, or the process that watched over it has gone.
+    /// A signal, Ctrl-C or a terminal that closed asked it to end, or the process that watched over it has gone.
     Interrupted,
     /// Something went wrong; `reason` says what.
     Failed,
@@ -54,9 +55,20 @@ impl fmt::Display for Ended {
     }
 }
 
+/// What the keys of this build's `summary.json` mean. Raise it when that changes.
+pub const SUMMARY_FORMAT: u32 = 1;
+
+/// Files of builds that did not say it yet mean the same.
+fn first_format() -> u32 {
+    1
+}
+
 /// What a run came to.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
+    /// See [`SUMMARY_FORMAT`].
+    #[serde(default = "first_format")]
+    pub format_version: u32,
     /// How it ended.
     pub ended: Ended,
     /// Why, if it failed.
@@ -73,19 +85,28 @@ pub struct Summary {
     /// Greedy episodes of the final weights, by training task.
     #[serde(default)]
     pub evaluation: BTreeMap<String, TaskResult>,
+    /// What the last learner found or did that somebody should know of.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub warnings: Vec<String>,
 }
 
 impl Summary {
     /// The summary of a run that is over; nothing if none was written, as when all was killed.
     ///
     /// # Errors
-    /// When it cannot be read, or is none.
+    /// When it cannot be read, is none, or is a newer build's.
     pub fn read(run_dir: &RunDir) -> io::Result<Option<Self>> {
-        match fs::read(run_dir.summary()) {
-            Ok(text) => Ok(Some(serde_json::from_slice(&text)?)),
+        match read_regular(&run_dir.summary(), TEXT_BYTES_MAX) {
+            Ok(text) => Self::parse(&text).map(Some),
             Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
             Err(error) => Err(error),
         }
+    }
+
+    /// Of the file's text.
+    fn parse(text: &[u8]) -> io::Result<Self> {
+        check_format(&serde_json::from_slice(text)?)?;
+        Ok(serde_json::from_slice(text)?)
     }
 
     /// Writes it, as a whole or not at all.
@@ -93,9 +114,7 @@ impl Summary {
     /// # Errors
     /// When the disk refuses.
     pub fn write(&self, run_dir: &RunDir) -> io::Result<()> {
-        let path = run_dir.summary();
-        let partial = path.with_extension("partial");
-        fs::write(&partial, serde_json::to_vec_pretty(self)?).and_then(|()| fs::rename(&partial, &path))
+        write_whole(&run_dir.summary(), &serde_json::to_vec_pretty(self)?)
     }
 
     /// Takes away what was said of the run's end when it goes on.
@@ -120,13 +139,53 @@ impl Summary {
         }
         let newest = checkpoint::newest_manifest(run_dir);
         let summary = Self {
+            format_version: SUMMARY_FORMAT,
             ended: Ended::Failed,
             reason: Some(reason.to_owned()),
             progress: newest.as_ref().map(|manifest| manifest.progress).unwrap_or_default(),
             wall_s: newest.as_ref().map_or(0.0, |manifest| manifest.wall_s),
             weights_digest: newest.map(|manifest| manifest.weights_digest),
             evaluation: BTreeMap::new(),
+            warnings: Vec::new(),
         };
         summary.write(run_dir)
+    }
+}
+
+/// Whether this build knows what a summary's keys mean.
+///
+/// # Errors
+/// When a newer build has written it.
+pub fn check_format(summary: &Value) -> io::Result<()> {
+    match summary.get("format_version") {
+        None => Ok(()),
+        Some(version) if *version == SUMMARY_FORMAT => Ok(()),
+        Some(version) => Err(io::Error::new(
+            ErrorKind::InvalidData,
+            format!(
+                "it has format version {version}, this build reads {SUMMARY_FORMAT}; use the build that wrote it"
+            ),
+        )),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_newer_builds_summary_is_refused_in_words_and_an_older_ones_read() {
+        let old = r#"{"ended":"stopped","env_steps":8,"episodes":4,"updates":1,"wall_s":0.5,"weights_digest":"ab"}"#;
+        let summary = Summary::parse(old.as_bytes()).unwrap();
+        assert_eq!((summary.format_version, summary.ended), (SUMMARY_FORMAT, Ended::Stopped));
+        let written = serde_json::to_vec(&summary).unwrap();
+        assert!(written.starts_with(br#"{"format_version":1,"#));
+        assert_eq!(Summary::parse(&written).unwrap(), summary);
+        // Whatever its keys are by then.
+        let newer = Summary::parse(br#"{"format_version":2,"outcome":"stopped"}"#).unwrap_err();
+        assert_eq!(
+            newer.to_string(),
+            "it has format version 2, this build reads 1; use the build that wrote it"
+        );
     }
 }

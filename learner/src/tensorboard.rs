@@ -131,7 +131,7 @@ fn cut(path: &Path, end: Option<u64>) -> io::Result<Option<String>> {
     let wanted = end.unwrap_or(bytes.len() as u64);
     let whole = whole_records(&bytes[..bytes.len().min(wanted as usize)]);
     if whole < bytes.len() {
-        OpenOptions::new().write(true).open(path)?.set_len(whole as u64)?;
+        rit_config::open_regular(path, OpenOptions::new().write(true))?.set_len(whole as u64)?;
     }
     let warning = || {
         let path = path.display();

@@ -27,7 +27,7 @@ use rit_episode::{Episode, RunSeed, Stream};
 use rit_policy::weights_file;
 use std::{
     collections::VecDeque,
-    io,
+    fs, io,
     path::PathBuf,
     sync::{Arc, mpsc},
 };
@@ -153,7 +153,7 @@ pub struct Trainer {
     env_steps_before: u64,
     news: Box<dyn FnMut(News) + Send>,
     writer: WriteQueue,
-    /// What somebody should know of how the run begins.
+    /// What somebody should know of how this learner began and ended.
     warnings: Vec<String>,
     /// What checkpoints say of where they come from.
     origin: Origin,
@@ -195,7 +195,10 @@ impl Trainer {
         let tasks = config.tasks(Split::Training).iter().map(ToString::to_string).collect();
         let mut warnings = loaded.as_ref().map(|loaded| loaded.warnings.clone()).unwrap_or_default();
         let manifest = loaded.as_ref().map(|loaded| &loaded.state.manifest);
+        // Of the checkpoint's own the log tells already.
+        let logged = warnings.len();
         let (metrics, tensorboard) = files(&run_dir, manifest, &mut warnings)?;
+        warnings.iter().skip(logged).for_each(|warning| tracing::warn!("{warning}"));
         let mut trainer = Self {
             replay: (learner.regime() == Regime::Replay).then(|| Replay::new(config.algorithm.buffer_size)),
             board: Arc::new(WeightsBoard::new(first, lag)),
@@ -493,6 +496,12 @@ fn files(
     let end = manifest
         .map(|Manifest { progress, metrics_len: len, .. }| End { env_steps: progress.env_steps, len: *len });
     let (path, header) = (run_dir.metrics(), Header::of(run_dir));
+    if manifest.is_none() && fs::metadata(&path).is_ok_and(|metadata| metadata.len() > 0) {
+        warnings.push(
+            "no checkpoint was written yet: training begins again at step 0, and metrics.jsonl with it"
+                .into(),
+        );
+    }
     let metrics = MetricsFile::open(&path, &header, end, wall_s);
     let (metrics, warning) = metrics.map_err(|error| TrainError::Metrics { path, error })?;
     warnings.extend(warning);

@@ -5,11 +5,12 @@ use crate::{
     resolve::may_go_on,
     run_dir::{
         CONFIG, INITIAL_WEIGHTS, LINEAGE, RUN_ID, TOKEN, existing, hex, random_bytes, read_config, utf8,
-        why_missing, write_whole,
+        why_missing,
     },
     run_lock::{LOCK, RunLock},
     run_place::{self, Came, PLACE},
     saved::{Saved, resolve_saved},
+    write_whole,
 };
 use std::{
     fs::{self, DirBuilder, OpenOptions, Permissions},
@@ -156,7 +157,7 @@ impl OwnedRunDir {
             Before::Nothing { folder_made } => remove_beginning(root, *folder_made).map_err(io(root)),
             Before::Run { config } if read_config(root)? != *config => {
                 let path = root.join(CONFIG);
-                write_whole(&path, config).map_err(io(&path))
+                write_whole(&path, config.as_bytes()).map_err(io(&path))
             }
             Before::Run { .. } => Ok(()),
         }
@@ -189,7 +190,7 @@ impl OwnedRunDir {
             let lineage = self.run_dir.lineage();
             for (name, digits) in [(LINEAGE, &hex(lineage)), (TOKEN, &token), (RUN_ID, &hex(run_id))] {
                 let path = root.join(name);
-                let written = write_whole(&path, &format!("{digits}\n"));
+                let written = write_whole(&path, format!("{digits}\n").as_bytes());
                 written.map_err(|error| RunDirError::Io { path, error })?;
             }
             // They lead to the other's learner.

@@ -1,35 +1,46 @@
-//! Reading what a person named, or what may lie in a run directory in place of a file.
+//! Reading and writing what a person named, or what may lie in a run directory in place of a file.
 
-use rustix::fs::{Mode, OFlags};
+use rustix::fs::OFlags;
 use std::{
-    fs::File,
-    io::{self, Read as _},
+    fs::{self, File, OpenOptions},
+    io::{self, ErrorKind, Read as _, Write as _},
+    os::unix::fs::OpenOptionsExt as _,
     path::Path,
 };
 
 /// No file that a person writes is longer.
 pub const TEXT_BYTES_MAX: u64 = 1 << 20;
 
-/// The bytes of a regular file. A named pipe, a device or a folder is no error that waits, and never endless.
+/// Opens a regular file. A named pipe, a socket, a device or a folder in its place is an error at once: it neither waits
+/// nor is it endless.
+///
+/// # Errors
+/// When it is no regular file, or the system refuses.
+pub fn open_regular(path: &Path, options: &mut OpenOptions) -> io::Result<File> {
+    let no_file = || io::Error::new(ErrorKind::InvalidInput, "it is no regular file");
+    // A pipe that has no other end is opened at once, and then seen for what it is. Regular files know no waiting.
+    let opened = options.custom_flags(OFlags::NONBLOCK.bits() as i32).open(path);
+    let file = match opened {
+        // A pipe to write to that nobody reads, or a socket.
+        Err(error) if error.raw_os_error() == Some(rustix::io::Errno::NXIO.raw_os_error()) => {
+            return Err(no_file());
+        }
+        opened => opened?,
+    };
+    if file.metadata()?.is_file() { Ok(file) } else { Err(no_file()) }
+}
+
+/// The bytes of a regular file.
 ///
 /// # Errors
 /// When it is no regular file, longer than `bytes_max`, or cannot be read.
 pub fn read_regular(path: &Path, bytes_max: u64) -> io::Result<Vec<u8>> {
-    // A pipe that nobody writes to is opened at once, and then seen for what it is.
-    let file = rustix::fs::open(path, OFlags::RDONLY | OFlags::NONBLOCK | OFlags::CLOEXEC, Mode::empty())?;
-    let file = File::from(file);
-    let metadata = file.metadata()?;
-    if !metadata.is_file() {
-        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is no regular file"));
-    }
-    let mut bytes = Vec::with_capacity(metadata.len().min(bytes_max) as usize);
+    let file = open_regular(path, OpenOptions::new().read(true))?;
+    let mut bytes = Vec::with_capacity(file.metadata()?.len().min(bytes_max) as usize);
     // What grows while it is read, or does not know its length, ends here too.
     file.take(bytes_max + 1).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > bytes_max {
-        return Err(io::Error::new(
-            io::ErrorKind::FileTooLarge,
-            format!("it has more than {bytes_max} bytes"),
-        ));
+        return Err(io::Error::new(ErrorKind::FileTooLarge, format!("it has more than {bytes_max} bytes")));
     }
     Ok(bytes)
 }
@@ -40,13 +51,25 @@ pub fn read_regular(path: &Path, bytes_max: u64) -> io::Result<Vec<u8>> {
 /// As [`read_regular`], and when it is not UTF-8.
 pub fn read_text(path: &Path) -> io::Result<String> {
     String::from_utf8(read_regular(path, TEXT_BYTES_MAX)?)
-        .map_err(|_| io::Error::new(io::ErrorKind::InvalidData, "it is no UTF-8 text"))
+        .map_err(|_| io::Error::new(ErrorKind::InvalidData, "it is no UTF-8 text"))
+}
+
+/// Writes a file for its user alone, as a whole or not at all.
+///
+/// # Errors
+/// When the system refuses, or a folder lies where it is prepared (`NAME.partial`).
+pub fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let partial = path.with_extension("partial");
+    // Whatever a process that was killed has left there.
+    let _ = fs::remove_file(&partial);
+    let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&partial)?;
+    file.write_all(bytes).and_then(|()| fs::rename(&partial, path))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::fs;
+    use rustix::fs::Mode;
 
     #[test]
     fn only_regular_files_of_a_known_length_are_read() {
@@ -62,6 +85,14 @@ mod tests {
         for other in [&*pipe, Path::new("/dev/zero"), folder.path()] {
             assert_eq!(message(other, 100), "it is no regular file", "{}", other.display());
         }
+        // Nor is anything written into a pipe.
+        let mut options = OpenOptions::new();
+        let written = open_regular(&pipe, options.append(true).create(true)).unwrap_err();
+        assert_eq!(written.to_string(), "it is no regular file");
+        fs::rename(&pipe, folder.path().join("file.partial")).unwrap();
+        write_whole(&path, b"new").unwrap();
+        assert_eq!(read_text(&path).unwrap(), "new");
+        assert!(!folder.path().join("file.partial").exists());
         assert!(message(&folder.path().join("nothing"), 100).contains("No such file"));
         fs::write(&path, [0xff]).unwrap();
         assert_eq!(read_text(&path).unwrap_err().to_string(), "it is no UTF-8 text");

@@ -1,14 +1,15 @@
 //! The run directory: where everything of one run lies, and under which names.
 
 use crate::{
-    Config, ConfigError, read_text, run_lock,
+    Config, ConfigError, read_text,
+    regular_file::write_whole,
+    run_lock,
     saved::{self, Saved, resolve_saved},
 };
 use rit_episode::wire::RunId;
 use std::{
     env, fs,
-    io::{self, ErrorKind, Write as _},
-    os::unix::fs::OpenOptionsExt as _,
+    io::{self, ErrorKind},
     path::{Path, PathBuf},
 };
 
@@ -117,8 +118,7 @@ impl RunDir {
             .map_err(|error| RunDirError::Config { path: root.join(CONFIG), error })?;
         let digits = |name: &str| {
             let path = root.join(name);
-            let text =
-                fs::read_to_string(&path).map_err(|error| RunDirError::Io { path: path.clone(), error })?;
+            let text = read_text(&path).map_err(|error| RunDirError::Io { path: path.clone(), error })?;
             from_hex(text.trim()).ok_or(RunDirError::NotHex(path))
         };
         let (run_id, token) = (digits(RUN_ID)?, hex(digits(TOKEN)?));
@@ -132,7 +132,7 @@ impl RunDir {
     /// When it cannot be written.
     pub fn write_config(&self, config: &Config) -> Result<(), RunDirError> {
         let path = self.config_path();
-        write_whole(&path, &self.to_toml(config)?).map_err(|error| RunDirError::Io { path, error })
+        write_whole(&path, self.to_toml(config)?.as_bytes()).map_err(|error| RunDirError::Io { path, error })
     }
 
     /// The directory itself, absolute.
@@ -172,7 +172,7 @@ impl RunDir {
 
     /// The web page's address with the token, if a learner of this run serves or served one.
     pub fn web_url(&self) -> Option<String> {
-        fs::read_to_string(self.web()).ok().map(|url| url.trim().to_owned())
+        read_text(&self.web()).ok().map(|url| url.trim().to_owned())
     }
 
     /// The resolved configuration.
@@ -235,7 +235,7 @@ impl RunDir {
     /// # Errors
     /// When it cannot be written.
     pub fn write_shared_memory(&self, directory: &Path) -> io::Result<()> {
-        write_whole(&self.shared_memory(), &format!("{}\n", directory.display()))
+        write_whole(&self.shared_memory(), format!("{}\n", directory.display()).as_bytes())
     }
 }
 
@@ -284,14 +284,6 @@ pub(crate) fn read_config(root: &Path) -> Result<String, RunDirError> {
         ErrorKind::NotFound => RunDirError::Missing { root: root.to_owned(), why: "it has no config.toml" },
         _ => RunDirError::Io { path, error },
     })
-}
-
-/// Writes a file for the run's user alone, as a whole or not at all.
-pub(crate) fn write_whole(path: &Path, text: &str) -> io::Result<()> {
-    let partial = path.with_extension("partial");
-    let mut options = fs::OpenOptions::new();
-    let mut file = options.write(true).create(true).truncate(true).mode(0o600).open(&partial)?;
-    file.write_all(text.as_bytes()).and_then(|()| fs::rename(&partial, path))
 }
 
 /// Sixteen bytes that no other run has and nobody guesses.

@@ -1,6 +1,6 @@
 //! One writer a run: an OS lock on the run's directory. It ends with the processes that hold it, however they end.
 
-use crate::RunDirError;
+use crate::{RunDirError, open_regular, read_text};
 use rustix::{fs::FlockOperation, io::Errno};
 use std::{
     fs::{self, File, OpenOptions},
@@ -69,7 +69,7 @@ impl RunLock {
         options.create(true).mode(0o600);
         let file = if is_first { options.write(true).truncate(true) } else { options.append(true) };
         // The lock holds without it: only the message is poorer.
-        let _ = file.open(root.join(LOCK)).and_then(|mut file| writeln!(file, "{}", process::id()));
+        let _ = open_regular(&root.join(LOCK), file).and_then(|mut file| writeln!(file, "{}", process::id()));
     }
 }
 
@@ -92,7 +92,7 @@ fn try_lock(root: &Path) -> Result<Option<File>, RunDirError> {
     }
     let path = root.join(LOCK);
     let mut options = OpenOptions::new();
-    let file = options.create(true).append(true).mode(0o600).open(&path).map_err(failed)?;
+    let file = open_regular(&path, options.create(true).append(true).mode(0o600)).map_err(failed)?;
     match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
         Ok(()) => Ok(Some(file)),
         Err(Errno::WOULDBLOCK) => Ok(None),
@@ -107,7 +107,7 @@ pub(crate) fn is_taken(root: &Path) -> bool {
 }
 
 fn holders(root: &Path) -> Vec<u32> {
-    let text = fs::read_to_string(root.join(LOCK)).unwrap_or_default();
+    let text = read_text(&root.join(LOCK)).unwrap_or_default();
     text.lines().filter_map(|line| line.trim().parse().ok()).collect()
 }
 

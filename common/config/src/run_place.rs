@@ -1,6 +1,6 @@
 //! Where a run was made: what tells a copied run directory from one that was moved.
 
-use crate::{RunDirError, run_dir::write_whole};
+use crate::{RunDirError, read_text, write_whole};
 use std::{
     fs, io,
     os::unix::fs::MetadataExt as _,
@@ -44,7 +44,7 @@ pub(crate) fn came(root: &Path, run_id_file: &str) -> Result<Came, RunDirError> 
         return Ok(Came::Moved);
     }
     let there = Place::of(&made.path).ok().filter(|there| there.identity != here.identity);
-    let run_id = |root: &Path| fs::read_to_string(root.join(run_id_file)).ok();
+    let run_id = |root: &Path| read_text(&root.join(run_id_file)).ok();
     if there.is_some() && run_id(&made.path).is_some_and(|theirs| Some(theirs) == run_id(root)) {
         return Ok(Came::CopiedFrom(made.path));
     }
@@ -57,7 +57,7 @@ pub(crate) fn came(root: &Path, run_id_file: &str) -> Result<Came, RunDirError> 
 /// When it cannot be written.
 pub(crate) fn write(root: &Path) -> io::Result<()> {
     let Place { identity: (device, inode), path } = Place::of(root)?;
-    write_whole(&root.join(PLACE), &format!("{device}:{inode}\n{}\n", path.display()))
+    write_whole(&root.join(PLACE), format!("{device}:{inode}\n{}\n", path.display()).as_bytes())
 }
 
 impl Place {
@@ -68,7 +68,7 @@ impl Place {
 
     /// Nothing where a run does not say it: then it was made before runs did.
     fn read(root: &Path) -> Option<Self> {
-        let text = fs::read_to_string(root.join(PLACE)).ok()?;
+        let text = read_text(&root.join(PLACE)).ok()?;
         let (identity, path) = text.split_once('\n')?;
         let (device, inode) = identity.split_once(':')?;
         let path = PathBuf::from(path.strip_suffix('\n').unwrap_or(path));

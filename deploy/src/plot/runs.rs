@@ -1,13 +1,15 @@
 //! What was measured of a run, and what kind of run it is.
 
 use crate::{cli::PlotMetric, failure::Failure};
-use rit_config::RunDir;
+use rit_config::{RunDir, read_regular};
 use serde_json::Value;
 use std::{
     collections::BTreeMap,
-    fs,
     path::{Path, PathBuf},
 };
+
+/// No file of metrics is longer.
+const BYTES_MAX: u64 = 1 << 32;
 
 /// The key of [`Kind`] under which evaluations lie apart by so many environment steps.
 const INTERVAL: &str = "evaluation.every_env_steps";
@@ -41,7 +43,9 @@ pub struct Run {
 pub fn read(given: &Path, metric: PlotMetric) -> Result<Run, Failure> {
     let path = if given.is_dir() { given.join("metrics.jsonl") } else { given.to_owned() };
     let named = |what: &str| Failure::input_message(format!("{}: {what}", path.display()));
-    let text = fs::read_to_string(&path).map_err(|error| named(&error.to_string()))?;
+    let bytes = read_regular(&path, BYTES_MAX).map_err(|error| named(&error.to_string()))?;
+    // What is no text is no line of metrics either, and counted as torn.
+    let text = String::from_utf8_lossy(&bytes).into_owned();
     let (found, torn_lines) = evaluations(&text, metric);
     if found.is_empty() {
         return Err(named("it holds no evaluation yet"));

@@ -2,7 +2,7 @@
 
 use super::schedule::{Blow, Planned};
 use crate::{child, control, failure::Failure, last_words::last_words};
-use rit_config::RunDir;
+use rit_config::{RunDir, TEXT_BYTES_MAX, read_regular};
 use rit_proto::v1::{ActorStatus, CheckpointRequest, PauseRequest, ResumeRequest, RunStatus, StatusRequest};
 use rustix::process::{Pid, kill_process};
 use serde_json::Value;
@@ -103,7 +103,7 @@ impl Run {
         if !status.success() {
             return Err(self.failed());
         }
-        let text = fs::read(self.root.join("summary.json")).map_err(Failure::runtime)?;
+        let text = read_regular(&self.root.join("summary.json"), TEXT_BYTES_MAX).map_err(Failure::runtime)?;
         serde_json::from_slice(&text).map_err(Failure::runtime)
     }
 

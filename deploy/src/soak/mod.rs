@@ -7,7 +7,7 @@ mod simulated;
 
 use crate::{cli::SoakOptions, experiments, failure::Failure, output};
 use fire::{Dealt, Run};
-use rit_config::RunDir;
+use rit_config::{RunDir, TEXT_BYTES_MAX, read_regular};
 use rit_episode::{Episode, wire::Expected};
 use rit_learner::replay_log;
 use schedule::Blow;
@@ -139,7 +139,7 @@ fn compare(
 /// The episodes that replay held at the end, each checked as on its way in.
 fn replay(root: &Path) -> Result<Vec<Episode>, Failure> {
     let (run_dir, config) = RunDir::open(root)?;
-    let summary = fs::read(run_dir.summary()).map_err(Failure::runtime)?;
+    let summary = read_regular(&run_dir.summary(), TEXT_BYTES_MAX).map_err(Failure::runtime)?;
     let summary: Value = serde_json::from_slice(&summary).map_err(Failure::runtime)?;
     let end = summary["episodes"].as_u64().unwrap_or_default();
     let numbers = end.saturating_sub(config.algorithm.buffer_size as u64)..end;

@@ -86,7 +86,7 @@ pub enum Event {
     Status(Standing),
     /// The learner was asked in vain, for this reason.
     NoAnswer(String),
-    /// Ctrl-C or SIGTERM: the run shall end in order.
+    /// Ctrl-C, SIGTERM or SIGHUP: the run shall end in order.
     Interrupted,
     /// Time has passed.
     Tick,

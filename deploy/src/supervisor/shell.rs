@@ -5,12 +5,12 @@ use crate::{
     control, logging::LogOptions, progress::Progress, report::printable, shutdown, warnings::Warnings,
 };
 use rit_config::{OwnedRunDir, RunDir};
-use rit_learner::life;
+use rit_learner::{life, summary::Summary};
 use rit_proto::{
     transport::Client,
     v1::{RunState, RunStatus, StatusRequest, StopRequest, control_client::ControlClient},
 };
-use std::{collections::VecDeque, fs, pin::Pin, time::Duration};
+use std::{collections::VecDeque, fs, io::ErrorKind, pin::Pin, time::Duration};
 use tokio::time::Instant;
 
 /// From one look for the learner's address to the next.
@@ -47,6 +47,7 @@ pub async fn watch_over(
         control: None,
         contact: Box::pin(std::future::pending()),
         web_url: None,
+        is_gone: false,
     };
     let interrupted = shutdown::requested(false);
     tokio::pin!(interrupted);
@@ -90,6 +91,8 @@ struct Shell<'a> {
     contact: Contact<'a>,
     /// The web page's address, once it was said.
     web_url: Option<String>,
+    /// The run directory was not there at the last look.
+    is_gone: bool,
 }
 
 impl Shell<'_> {
@@ -105,7 +108,10 @@ impl Shell<'_> {
                     Effect::StopRun => self.stop_run(),
                     Effect::RemoveSharedMemory => life::remove_dead(self.run_dir),
                     Effect::Say(line) => self.progress.say(&line),
-                    Effect::Over(outcome) => return Some(outcome),
+                    Effect::Over(outcome) => {
+                        self.say_last_warnings();
+                        return Some(outcome);
+                    }
                 }
             }
         }
@@ -143,9 +149,9 @@ impl Shell<'_> {
                 Event::Answers
             }
             Contacted::Status(status) => {
-                for warning in self.warnings.new_of(&status) {
-                    self.progress.say(&format!("warning: {}", printable(&warning)));
-                }
+                let warnings = self.warnings.new_of(&status);
+                self.say_warnings(&warnings);
+                self.look_for_run_dir();
                 self.progress.update(&status);
                 Event::Status(standing(&status))
             }
@@ -159,11 +165,38 @@ impl Shell<'_> {
         event
     }
 
+    fn say_warnings(&self, warnings: &[String]) {
+        for warning in warnings {
+            self.progress.say(&format!("warning: {}", printable(warning)));
+        }
+    }
+
+    /// A learner that had little to do may have ended before it was asked how it stands.
+    fn say_last_warnings(&mut self) {
+        if let Ok(Some(summary)) = Summary::read(self.run_dir) {
+            let warnings = self.warnings.left_of(summary.warnings);
+            self.say_warnings(&warnings);
+        }
+    }
+
     fn stop_run(&mut self) {
         if let Some(mut control) = self.control.clone() {
             // Its end is the answer; one that does not hear is asked how it stands, and found hanging.
             tokio::spawn(async move { control.stop(StopRequest { drain: false, interrupted: true }).await });
         }
+    }
+
+    /// Says that the run directory is gone, once: training alone would notice it at the next checkpoint.
+    fn look_for_run_dir(&mut self) {
+        let root = self.run_dir.root();
+        let is_gone = fs::metadata(root).is_err_and(|error| error.kind() == ErrorKind::NotFound);
+        if is_gone && !self.is_gone {
+            let root = root.display();
+            self.progress.say(&format!(
+                "warning: {root} is gone, removed or renamed: nothing of this run is kept until it is there again"
+            ));
+        }
+        self.is_gone = is_gone;
     }
 
     /// Says where the web page is, when it is there first and when it moves.

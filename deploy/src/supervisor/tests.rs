@@ -412,3 +412,46 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn a_learner_that_takes_long_to_begin_is_waited_for_with_a_word() {
+    let (mut supervisor, at) = (Supervisor::new(1, "logs".into()), seconds);
+    supervisor.handle(Event::Begin, at(0));
+    assert_eq!(supervisor.deadline(), Some(at(30)));
+    let said = supervisor.handle(Event::Tick, at(30));
+    let [Effect::Say(line)] = &said[..] else { panic!("{said:?}") };
+    assert_eq!(
+        line,
+        "the learner has not answered for 30 s; it is waited for up to 600 s (log: logs/learner.log)"
+    );
+    assert_eq!(supervisor.deadline(), Some(at(600)));
+    assert!(supervisor.handle(Event::Tick, at(31)).is_empty(), "it is said once");
+    // Whoever wants the end does not wait so long.
+    supervisor.handle(Event::Interrupted, at(40));
+    assert_eq!(supervisor.deadline(), Some(at(30)));
+    assert_eq!(supervisor.handle(Event::Tick, at(40)), [Effect::AskToEnd(Place::Learner)]);
+    let ended = Event::Ended { place: Place::Learner, exit: Exit::Signal(KILL), last_words: String::new() };
+    assert_eq!(supervisor.handle(ended, at(50)), [Effect::Over(Outcome::Interrupted)]);
+
+    // One that never answers is given up.
+    let mut supervisor = Supervisor::new(1, "logs".into());
+    supervisor.handle(Event::Begin, at(0));
+    supervisor.handle(Event::Tick, at(30));
+    assert_eq!(supervisor.handle(Event::Tick, at(600)), [Effect::AskToEnd(Place::Learner)]);
+}
+
+#[test]
+fn an_actor_that_cannot_use_what_the_learner_sends_ends_the_run_at_once() {
+    let mut supervisor = Supervisor::new(1, "logs".into());
+    for event in [Event::Begin, Event::Answers] {
+        supervisor.handle(event, seconds(0));
+    }
+    let last_words = "weights 7: a piece begins at byte 8, where 4 should come; use one build".to_owned();
+    let exit = Exit::Code(INCOMPATIBLE.into());
+    let ended = Event::Ended { place: Place::Actor(0), exit, last_words: last_words.clone() };
+    assert_eq!(supervisor.handle(ended, seconds(1)), [Effect::AskToEnd(Place::Learner)]);
+    let ended = Event::Ended { place: Place::Learner, exit: Exit::Code(130), last_words: String::new() };
+    let message = format!("actor-0: {last_words}");
+    let failed = Outcome::Failed { input: false, message };
+    assert_eq!(supervisor.handle(ended, seconds(2)), [Effect::Over(failed)]);
+}

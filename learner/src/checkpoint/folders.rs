@@ -4,7 +4,7 @@
 //! step. A name is never used while another folder has it, so at no moment is a checkpoint taken away before its
 //! successor lies there.
 
-use super::{CheckpointError, MANIFEST, Manifest, io};
+use super::{CheckpointError, FILE_BYTES_MAX, MANIFEST, Manifest, io};
 use std::{
     fs,
     io::ErrorKind,
@@ -40,7 +40,8 @@ impl Folder {
 
     /// What its manifest says, whether or not that is in order.
     pub fn manifest(&self) -> Option<Manifest> {
-        serde_json::from_slice(&fs::read(self.path.join(MANIFEST)).ok()?).ok()
+        let text = rit_config::read_regular(&self.path.join(MANIFEST), FILE_BYTES_MAX);
+        serde_json::from_slice(&text.ok()?).ok()
     }
 }
 

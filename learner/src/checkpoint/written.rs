@@ -2,8 +2,11 @@
 //! that a run whose checkpoints are gone is no new run.
 
 use super::{CheckpointError, LATEST, io, write_whole};
-use crate::checkpoint::origin::Origin;
-use rit_config::RunDir;
+use crate::{
+    checkpoint::origin::Origin,
+    summary::{Ended, Summary},
+};
+use rit_config::{RunDir, TEXT_BYTES_MAX, read_regular};
 use serde::{Deserialize, Serialize};
 use std::{fs, path::PathBuf};
 
@@ -34,9 +37,16 @@ pub(super) fn remember(run_dir: &RunDir, origin: &Origin, newest: &str) -> Resul
 pub(super) fn newest(run_dir: &RunDir) -> Option<String> {
     let path = path(run_dir);
     if path.exists() {
-        let written = fs::read(&path).ok().and_then(|text| serde_json::from_slice::<Written>(&text).ok());
+        let written = read_regular(&path, TEXT_BYTES_MAX)
+            .ok()
+            .and_then(|text| serde_json::from_slice::<Written>(&text).ok());
         return Some(written.map_or_else(|| "checkpoints.json tells of it".into(), |written| written.newest));
     }
     // What tells of it where that file is gone.
-    fs::read_link(run_dir.checkpoints().join(LATEST)).ok().map(|target| target.display().to_string())
+    let latest = fs::read_link(run_dir.checkpoints().join(LATEST));
+    latest.ok().map(|target| target.display().to_string()).or_else(|| {
+        // A run that has ended in order wrote one; one that failed may never have come so far.
+        let ended = Summary::read(run_dir).ok().flatten()?.ended;
+        (ended != Ended::Failed).then(|| "summary.json tells of it".into())
+    })
 }

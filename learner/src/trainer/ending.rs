@@ -4,9 +4,9 @@ use super::{News, TrainError, Trainer, Work};
 use crate::{
     evaluation::by_task,
     replay_log::remedy,
-    summary::{Ended, Summary},
+    summary::{Ended, SUMMARY_FORMAT, Summary},
 };
-use rit_config::Config;
+use rit_config::{Config, write_whole};
 use rit_policy::{TaskNames, weights_file};
 use std::{
     collections::BTreeMap,
@@ -44,8 +44,9 @@ impl Trainer {
         if let Err(error) = checkpointed {
             return Err(TrainError::Checkpoint(self.rescue(error)));
         }
-        let summary = Summary { evaluation, ..self.summary(ended) };
+        let mut summary = Summary { evaluation, ..self.summary(ended) };
         self.insist("summary.json", work, |trainer| {
+            summary.warnings.clone_from(&trainer.warnings);
             summary.write(&trainer.run_dir).map_err(|error| format!("{error}{}", remedy(&error)))
         })
         .map_err(TrainError::Summary)?;
@@ -54,12 +55,14 @@ impl Trainer {
 
     pub(super) fn summary(&self, ended: Ended) -> Summary {
         Summary {
+            format_version: SUMMARY_FORMAT,
             ended,
             reason: None,
             progress: self.standing.progress,
             wall_s: self.metrics.wall_s(),
             weights_digest: Some(weights_file::digest(self.learner.params())),
             evaluation: BTreeMap::new(),
+            warnings: self.warnings.clone(),
         }
     }
 
@@ -76,7 +79,7 @@ impl Trainer {
         loop {
             let error = match attempt(self) {
                 Ok(()) if refused => {
-                    (self.news)(News::Warning(format!("{what} is written now")));
+                    self.warn(format!("{what} is written now"));
                     return Ok(());
                 }
                 Ok(()) => return Ok(()),
@@ -88,11 +91,11 @@ impl Trainer {
                 return Err(error);
             }
             if !std::mem::replace(&mut refused, true) {
-                (self.news)(News::Warning(format!(
+                self.warn(format!(
                     "{what} is not written: {error}; trying again for {} s, then the weights go to \
                      checkpoints.rescue_dir, if that is set (`rit ctl set` can do so now)",
                     limit.as_secs()
-                )));
+                ));
             }
             match work.recv_timeout(RETRY_EVERY) {
                 Ok(Work::Set(config)) => self.config = Config::clone(&config),
@@ -102,6 +105,11 @@ impl Trainer {
                 Err(mpsc::RecvTimeoutError::Disconnected) => thread::sleep(RETRY_EVERY),
             }
         }
+    }
+
+    fn warn(&mut self, what: String) {
+        self.warnings.push(what.clone());
+        (self.news)(News::Warning(what));
     }
 
     /// Writes the weights to `checkpoints.rescue_dir`, if there is one; returns the error with what came of it.
@@ -117,7 +125,7 @@ impl Trainer {
             weights_file::encode(self.learner.model(), &TaskNames::of(&self.config), self.learner.params());
         let written = weights.map_err(|error| error.to_string()).and_then(|bytes| {
             fs::create_dir_all(folder)
-                .and_then(|()| fs::write(&path, bytes))
+                .and_then(|()| write_whole(&path, &bytes))
                 .map_err(|error| format!("{error}{}", remedy(&error)))
         });
         match written {

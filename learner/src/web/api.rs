@@ -15,12 +15,13 @@ use axum::{
     routing::{get, post},
 };
 use rit_algo::Regime;
+use rit_config::{open_regular, read_text};
 use rit_env::{BodyKind, LinkKind, Scene, SceneLink, Split, Task};
 use rit_episode::Action;
 use rit_proto::{transport::AllTaken, v1};
 use serde::{Deserialize, Serialize};
 use std::{
-    fs::{self, File},
+    fs::{self, OpenOptions},
     io::{self, Read as _, Seek as _, SeekFrom},
     path::Path,
 };
@@ -146,7 +147,7 @@ async fn run(State(page): State<Page>) -> Result<Json<Run>, ApiError> {
         has_scenes: config.tasks(Split::Training).iter().all(|task| task.spec().has_scenes),
         evaluation_episodes: config.evaluation.episodes,
         testing_episodes: config.evaluation.testing_episodes,
-        config: fs::read_to_string(page.run_dir.config_path())?,
+        config: read_text(&page.run_dir.config_path())?,
     }))
 }
 
@@ -336,7 +337,7 @@ async fn log(
 
 /// The last whole lines of a file.
 fn tail(path: &Path) -> io::Result<String> {
-    let mut file = File::open(path)?;
+    let mut file = open_regular(path, OpenOptions::new().read(true))?;
     let skipped = file.metadata()?.len().saturating_sub(LOG_BYTES);
     file.seek(SeekFrom::Start(skipped))?;
     let mut bytes = Vec::new();

@@ -23,13 +23,12 @@ use hyper_util::{
     rt::{TokioIo, TokioTimer},
     service::TowerToHyperService,
 };
-use rit_config::{RunDir, WebListen};
+use rit_config::{RunDir, WebListen, write_whole};
 use rit_proto::transport::{Guarded, PlaceLimits, Places, STRANGER_DEADLINE};
 use std::{
-    fs::{self, OpenOptions},
-    io::{self, ErrorKind, Write as _},
+    fs,
+    io::{self, ErrorKind},
     net::SocketAddr,
-    os::unix::fs::OpenOptionsExt as _,
     path::PathBuf,
     sync::Arc,
     time::{Duration, SystemTime, UNIX_EPOCH},
@@ -245,10 +244,7 @@ async fn with_headers(mut response: Response) -> Response {
 /// The page's address for a person: it carries the token.
 fn write_url(run_dir: &RunDir, address: SocketAddr) -> io::Result<()> {
     let (path, url) = (run_dir.web(), format!("http://{address}/?token={}\n", run_dir.token()));
-    let partial = path.with_extension("partial");
-    let mut file = OpenOptions::new().create(true).truncate(true).write(true).mode(0o600).open(&partial)?;
-    file.write_all(url.as_bytes())?;
-    fs::rename(partial, path)
+    write_whole(&path, url.as_bytes())
 }
 
 /// The port that a learner of this run had before.

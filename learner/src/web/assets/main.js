@@ -81,7 +81,7 @@ function showStatus() {
   byId("progress-left").textContent = speed?.env_steps_per_s > 0.5 ? `${duration(left)} left` : "";
   showWarnings(status);
   showTiles(status, speed);
-  showProcesses(status);
+  showProcesses(status, link === "over");
   showLedger(status.ledger);
 }
 

@@ -40,7 +40,7 @@ function actorState({ hung, silent_s, outstanding }, paused) {
   return [paused ? "paused" : "waiting", ""];
 }
 
-export function showProcesses(status) {
+export function showProcesses(status, over) {
   const row = (name, [state, look], id, episodes, outstanding, silent) => {
     const number = (text) => make("td", { class: "n" }, text);
     const pill = make("td", {}, make("span", { class: `pill ${look}` }, state));
@@ -49,11 +49,11 @@ export function showProcesses(status) {
   const looks = { running: "good", paused: "warn", stopping: "warn" };
   const byName = (a, b) => a.name.localeCompare(b.name, undefined, { numeric: true });
   const actors = status.actors.toSorted(byName).map((actor) => {
-    const state = actorState(actor, status.state === "paused");
+    const state = over ? ["ended", ""] : actorState(actor, status.state === "paused");
     return row(actor.name, state, actor.pid, grouped(actor.episodes), grouped(actor.outstanding), `${actor.silent_s.toFixed(1)} s`);
   });
   byId("processes").replaceChildren(
-    row("learner", [status.state, looks[status.state] ?? ""], status.pid, grouped(status.episodes), "", ""),
+    row("learner", over ? ["ended", ""] : [status.state, looks[status.state] ?? ""], status.pid, grouped(status.episodes), "", ""),
     ...actors,
   );
 }
