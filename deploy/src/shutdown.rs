@@ -4,47 +4,44 @@
 use std::fs;
 use tokio::{
     io::AsyncReadExt as _,
-    signal::unix::{SignalKind, signal},
+    signal::unix::{Signal, SignalKind, signal},
 };
 
 /// Resolves at the first of Ctrl-C, SIGTERM, SIGHUP and, where `supervised`, the end of standard input: the supervisor
 /// holds its other end, and the system closes it however the supervisor dies. A SIGHUP that is ignored, as `nohup`
 /// starts its program, stays ignored.
-pub async fn requested(supervised: bool) {
-    let terminated = received(SignalKind::terminate());
-    let hung_up = async {
-        if ignores(SignalKind::hangup()) {
-            std::future::pending::<()>().await;
-        }
-        received(SignalKind::hangup()).await;
-    };
-    let interrupted = async {
-        if tokio::signal::ctrl_c().await.is_err() {
-            std::future::pending::<()>().await;
-        }
-    };
-    let abandoned = async {
+///
+/// Signals are caught from this call on, though the future be waited for much later.
+pub fn requested(supervised: bool) -> impl Future<Output = ()> {
+    let terminated = caught(SignalKind::terminate());
+    let interrupted = caught(SignalKind::interrupt());
+    let hung_up = if ignores(SignalKind::hangup()) { None } else { caught(SignalKind::hangup()) };
+    let abandoned = async move {
         if !supervised {
             std::future::pending::<()>().await;
         }
         let (mut stdin, mut buffer) = (tokio::io::stdin(), [0; 64]);
         while stdin.read(&mut buffer).await.is_ok_and(|read| read > 0) {}
     };
-    tokio::select! {
-        () = terminated => tracing::info!("SIGTERM: ending"),
-        () = hung_up => tracing::info!("SIGHUP: ending"),
-        () = interrupted => tracing::info!("interrupted: ending"),
-        () = abandoned => tracing::info!("whoever started this process has gone: ending"),
+    async move {
+        tokio::select! {
+            () = next(terminated) => tracing::info!("SIGTERM: ending"),
+            () = next(interrupted) => tracing::info!("interrupted: ending"),
+            () = next(hung_up) => tracing::info!("SIGHUP: ending"),
+            () = abandoned => tracing::info!("whoever started this process has gone: ending"),
+        }
     }
 }
 
-async fn received(kind: SignalKind) {
-    match signal(kind) {
-        Ok(mut signals) => {
-            signals.recv().await;
-        }
-        // Without the handler the signal ends the process by itself.
-        Err(_) => std::future::pending().await,
+/// Catches a signal; where that does not go, it ends the process by itself.
+fn caught(kind: SignalKind) -> Option<Signal> {
+    signal(kind).ok()
+}
+
+async fn next(signals: Option<Signal>) {
+    match signals {
+        Some(mut signals) => drop(signals.recv().await),
+        None => std::future::pending().await,
     }
 }
 
