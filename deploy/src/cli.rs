@@ -41,6 +41,11 @@ pub enum Command {
     Plot(PlotOptions),
     /// Make an authority, and certificates for a learner and for those who call it over TCP
     Certificates(CertificatesOptions),
+    /// Environments of your own
+    Env {
+        #[command(subcommand)]
+        command: EnvCommand,
+    },
     /// List runs: what each is, how it stands, and what it has reached
     Runs(RunsOptions),
     /// List the task sets' experiments and the algorithms that come with the program
@@ -190,6 +195,34 @@ pub struct CertificatesOptions {
     /// Days that they are valid for
     #[arg(long, value_name = "N", default_value_t = 365, value_parser = within::<u32>(1, 3650))]
     pub days: u32,
+}
+
+#[derive(Debug, Subcommand)]
+pub enum EnvCommand {
+    /// Hold environments to what they promise: random episodes, each again, and what is wrong in words
+    Check(EnvCheckOptions),
+}
+
+#[derive(Args, Debug)]
+pub struct EnvCheckOptions {
+    /// Name of an experiment or path of a TOML file, whose tasks are checked
+    #[arg(required_unless_present = "python")]
+    pub experiment: Option<String>,
+    /// A Python function in place of the experiment's: MODULE:FUNCTION
+    #[arg(long, value_name = "MODULE:FUNCTION", requires = "tasks")]
+    pub python: Option<String>,
+    /// Names of tasks, in place of the experiment's training tasks
+    #[arg(long, value_delimiter = ',')]
+    pub tasks: Vec<String>,
+    /// Episodes of each task
+    #[arg(long, default_value_t = 10, value_parser = within::<u32>(1, EPISODES_MAX.into()))]
+    pub episodes: u32,
+    /// Set any key; may be given again and again
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub settings: Vec<String>,
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
 }
 
 #[derive(Args, Debug)]

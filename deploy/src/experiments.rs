@@ -1,6 +1,6 @@
 //! The experiments that come with the program, and a person's own.
 
-use crate::{cli::ConfigOptions, failure::Failure, output};
+use crate::{cli::ConfigOptions, failure::Failure, output, python_worlds};
 use rit_algo::Method;
 use rit_config::{Config, read_text, resolve, set};
 use std::{path::Path, process::ExitCode};
@@ -67,7 +67,21 @@ pub fn load(experiment: &str, settings: &[String]) -> Result<Experiment, Failure
     }
     let text = read_text(path).map_err(|error| Failure::input_message(format!("{experiment}: {error}")))?;
     let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-    Ok(Experiment { name, config: resolve(&text, experiment, &settings)? })
+    Ok(Experiment { name, config: with_worlds(&text, experiment, settings)? })
+}
+
+/// Resolves an experiment's text under these settings.
+///
+/// # Errors
+/// When something in it is wrong.
+pub fn resolve_text(text: &str, source_name: &str, settings: &[String]) -> Result<Config, Failure> {
+    with_worlds(text, source_name, parse_settings(settings)?)
+}
+
+/// Environments in Python are asked what they are.
+fn with_worlds(text: &str, source_name: &str, mut settings: Vec<Table>) -> Result<Config, Failure> {
+    settings.extend(python_worlds::described(text, source_name, &settings)?);
+    Ok(resolve(text, source_name, &settings)?)
 }
 
 /// `section.key=value` settings as tables.

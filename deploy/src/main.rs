@@ -20,6 +20,7 @@ mod player;
 mod plot;
 mod processes;
 mod progress;
+mod python_worlds;
 mod render;
 mod report;
 mod runs;
@@ -32,7 +33,7 @@ mod warnings;
 mod watch;
 
 use clap::{CommandFactory as _, Parser as _};
-use cli::{Cli, Command};
+use cli::{Cli, Command, EnvCommand};
 use failure::Failure;
 use std::process::ExitCode;
 
@@ -73,6 +74,7 @@ async fn run(cli: Cli) -> Result<ExitCode, Failure> {
         Command::Bench(options) => bench::run(&options),
         Command::Plot(options) => plot::run(&options),
         Command::Certificates(options) => certificates::run(&options),
+        Command::Env { command: EnvCommand::Check(options) } => python_worlds::check(&options),
         Command::Runs(options) => runs::run(&options),
         Command::Experiments => experiments::print(),
         Command::Completions { shell } => {

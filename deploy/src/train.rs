@@ -9,7 +9,7 @@ use crate::{
     logging::LogOptions,
     output::{self, Reader},
     progress::Progress,
-    report,
+    python_worlds, report,
     supervisor::{Outcome, watch_over},
 };
 use rit_config::{Config, OwnedRunDir, RunDir};
@@ -112,6 +112,7 @@ fn prepare(options: &ConfigOptions) -> Result<Prepared, Failure> {
     let root = owned.run_dir().root().display();
     let actors = report::counted(config.actors.count as u64, "actor");
     let mut said = vec![format!("{name}: learner and {actors}, run directory {root}")];
+    said.extend(python_worlds::not_reproducible(&config));
     if let Some(beginning) = beginning {
         if let Err(failure) = beginning.write(owned.run_dir()) {
             owned.undo()?;

@@ -1,7 +1,7 @@
 //! The resolved configuration: complete, and within its limits. `presets/all.toml` says what each key means.
 
 use crate::{
-    ConfigError,
+    ConfigError, foreign,
     keys::quoted,
     method_keys::{self, by_name},
     number,
@@ -51,6 +51,27 @@ pub struct Environment {
     pub spawn_rotate: SpawnRotate,
     pub stats: StatsVersion,
     pub enemy_medivac: ScriptedMedivac,
+    pub python: String,
+    pub interpreter: String,
+    pub environments_per_worker: usize,
+    pub timeout_ms: u64,
+    pub worker_memory_mb: u64,
+    pub worlds: Vec<World>,
+    pub feature_names: Vec<String>,
+    pub action_names: Vec<String>,
+}
+
+/// What a task in Python is: `rit train` asks before a run begins.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs, reason = "presets/all.toml documents every key, for users too")]
+pub struct World {
+    pub task: String,
+    pub n_agents: usize,
+    pub n_entities: usize,
+    pub steps_max: usize,
+    pub has_wins: bool,
+    pub is_reproducible: bool,
 }
 
 /// Whether armies face each other at a random angle.
@@ -335,6 +356,7 @@ impl Config {
     pub(crate) fn to_table(&self) -> Result<Table, ConfigError> {
         let mut table = Table::try_from(self).map_err(|error| ConfigError::Value(error.to_string()))?;
         method_keys::retain(&mut table, self.algorithm.name);
+        foreign::retain(&mut table, self);
         Ok(table)
     }
 
@@ -470,6 +492,14 @@ impl Config {
         vec![
             ("environment.view_radius", self.environment.view_radius.into(), 0.0, f64::INFINITY),
             ("environment.approach_shaping", self.environment.approach_shaping.into(), 0.0, 1e3),
+            (
+                "environment.environments_per_worker",
+                self.environment.environments_per_worker.into(),
+                1.0,
+                1024.0,
+            ),
+            ("environment.timeout_ms", self.environment.timeout_ms.into(), 1.0, 1e9),
+            ("environment.worker_memory_mb", self.environment.worker_memory_mb.into(), 0.0, 1e9),
             ("algorithm.gamma", algorithm.gamma.into(), 0.0, 1.0),
             ("algorithm.lr", algorithm.lr.into(), 1e-12, 1.0),
             // At 1 it would never take a gradient in, and every step would be a division by almost nothing.

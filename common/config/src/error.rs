@@ -102,6 +102,48 @@ pub enum ConfigError {
         /// The task.
         name: String,
     },
+    /// Environments in Python and a task set of ours.
+    #[error(
+        "environment.python and environment.task_set = {task_set} both say what is played; leave one out"
+    )]
+    TwoTaskSets {
+        /// The task set, in quotes.
+        task_set: String,
+    },
+    /// Tasks in Python, and nothing that makes them.
+    #[error("environment.python is missing: write \"MODULE:FUNCTION\"")]
+    NoPython,
+    /// No task to learn from.
+    #[error(
+        "environment.training_tasks names no task; name those to learn from, by which environment.python makes them"
+    )]
+    NoTrainingTasks,
+    /// Nobody has asked Python yet.
+    #[error(
+        "environment.worlds says nothing of the tasks: `rit train` and `rit learner --new` ask environment.python for it"
+    )]
+    NoWorlds,
+    /// A task that Python was not asked for.
+    #[error("environment.worlds does not know {task}; begin a new run with this task among its tasks")]
+    NoWorld {
+        /// The task, in quotes.
+        task: String,
+    },
+    /// Sizes that make no task.
+    #[error("environment.worlds: {task} needs at least one agent, as many entities as agents, and a feature")]
+    WorldSizes {
+        /// The task, in quotes.
+        task: String,
+    },
+    /// Sizes beyond what an episode can have.
+    #[error("environment.worlds: {0}")]
+    Dims(#[from] rit_episode::DimsError),
+    /// A key of environments in Python.
+    #[error("{key} means nothing without environment.python; leave it out")]
+    NotOfPython {
+        /// The key.
+        key: String,
+    },
     /// A key that this method has no use for.
     #[error("{key} means nothing to {method}; these have it: {owners}")]
     NotOfMethod {

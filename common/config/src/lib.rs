@@ -7,6 +7,7 @@
 
 mod config;
 mod error;
+mod foreign;
 mod keys;
 mod method_keys;
 mod number;
@@ -20,9 +21,10 @@ mod saved;
 
 pub use config::{
     Actors, Algorithm, Checkpoints, Config, Environment, Evaluation, Learner, Network, OptimizerName,
-    SpawnRotate, Tls, Training, Until, Web, WebListen,
+    SpawnRotate, Tls, Training, Until, Web, WebListen, World,
 };
 pub use error::ConfigError;
+pub use foreign::{PythonAsked, python_answered, python_asked};
 pub use number::{CountError, WHOLE_MAX, count};
 pub use owned_run_dir::OwnedRunDir;
 pub use regular_file::{TEXT_BYTES_MAX, open_regular, read_regular, read_text, write_whole};

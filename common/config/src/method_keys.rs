@@ -88,6 +88,7 @@ fn family(task_set: TaskSet) -> &'static str {
         TaskSet::MatrixGame => "matrix",
         TaskSet::CooperativeNavigation | TaskSet::PredatorPrey | TaskSet::PredatorPreyPro => "mpe",
         TaskSet::Combat(_) => "smac",
+        TaskSet::Foreign(_) => "foreign",
     }
 }
 
@@ -97,6 +98,7 @@ pub(crate) fn presets(method: Method, task_set: TaskSet) -> Result<Vec<Table>, C
     let of_family = match family {
         "matrix" => include_str!("presets/matrix.toml"),
         "smac" => include_str!("presets/smac.toml"),
+        "foreign" => "",
         _ => include_str!("presets/mpe.toml"),
     };
     let mut of_method = parse(preset(method), "the method's preset")?;

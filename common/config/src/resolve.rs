@@ -1,6 +1,6 @@
 //! From what a person typed to a [`Config`].
 
-use crate::{Config, ConfigError, Environment, SpawnRotate, Until, keys, method_keys};
+use crate::{Config, ConfigError, Environment, SpawnRotate, Until, foreign, keys, method_keys};
 use rit_algo::{Method, Regime};
 use rit_env::{
     TaskSet,
@@ -27,6 +27,7 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
     method_keys::translate_ablations(&mut set, method_keys::named(&typed)?)?;
     merge(&mut typed, set);
     keys::check(&typed, &defaults)?;
+    foreign::choose(&mut typed)?;
     let (method, task_set) = (method_keys::named(&typed)?, task_set(&typed)?);
     method_keys::check(&typed, method)?;
     let mut all = defaults;
@@ -34,7 +35,11 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
         merge(&mut all, preset);
     }
     merge(&mut all, typed);
-    let config: Config = all.try_into().map_err(|error| wrong_value(&error))?;
+    let mut config: Config = all.try_into().map_err(|error| wrong_value(&error))?;
+    if matches!(task_set, TaskSet::Foreign(_)) {
+        config.environment.task_set = foreign::task_set(&config.environment)?;
+        config.dims().validate()?;
+    }
     for (key, value, min, max) in config.limits() {
         value.check(key, min, max)?;
     }
@@ -107,7 +112,11 @@ pub fn all_keys() -> Vec<String> {
 }
 
 /// Keys, or sections, that a run may change when it goes on: no weight follows from them.
-const FREE: [&str; 11] = [
+const FREE: [&str; 15] = [
+    "environment.environments_per_worker",
+    "environment.interpreter",
+    "environment.timeout_ms",
+    "environment.worker_memory_mb",
     "training",
     "evaluation",
     "checkpoints",
@@ -213,7 +222,7 @@ pub fn is_live(key: &str) -> bool {
     is_under(key, &LIVE)
 }
 
-fn defaults() -> Result<Table, ConfigError> {
+pub(crate) fn defaults() -> Result<Table, ConfigError> {
     parse(DEFAULTS, "presets/all.toml")
 }
 
@@ -235,7 +244,7 @@ fn one_line(error: &toml::de::Error) -> String {
 }
 
 /// What the deserialiser found, with the key, which it names apart from its message.
-fn wrong_value(error: &toml::de::Error) -> ConfigError {
+pub(crate) fn wrong_value(error: &toml::de::Error) -> ConfigError {
     let (text, message) = (error.to_string(), one_line(error));
     let named = text.lines().rev().find_map(|line| line.strip_prefix("in `")?.strip_suffix('`'));
     let key = named.unwrap_or_default().to_owned();
@@ -253,7 +262,7 @@ fn wrong_value(error: &toml::de::Error) -> ConfigError {
 }
 
 /// Puts `above` over `below`, table by table.
-fn merge(below: &mut Table, above: Table) {
+pub(crate) fn merge(below: &mut Table, above: Table) {
     for (key, value) in above {
         match (below.get_mut(&key), value) {
             (Some(Value::Table(below)), Value::Table(above)) => merge(below, above),

@@ -18,7 +18,7 @@ pub struct Step {
 }
 
 /// What a task is, as data: known without building its world.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Spec {
     /// Number of agents, constant.
     pub n_agents: usize,

@@ -11,6 +11,7 @@ pub mod combat;
 pub mod conformance;
 mod environment;
 mod factory;
+mod foreign;
 pub mod matrix_game;
 mod names;
 pub mod particle;
@@ -25,7 +26,8 @@ pub use environment::{
     SceneLink, SceneUnit, Spec, Step,
 };
 pub use factory::{Embedded, EnvironmentFactory};
+pub use foreign::{ForeignSet, ForeignTask};
 pub use scripts::{Script, UnfitScript};
 pub use seated::Seated;
-pub use task_set::{Split, Task, TaskError, TaskSet};
+pub use task_set::{PYTHON, Split, Task, TaskError, TaskSet};
 pub use unknown_name::UnknownName;

@@ -11,6 +11,7 @@ impl TaskSet {
                 named(&["x", "y", "velocity.x", "velocity.y", "kind.agent", "kind.landmark", "kind.prey"])
             }
             Self::Combat(set) => combat_features(set),
+            Self::Foreign(set) => set.feature_names.clone(),
         }
     }
 
@@ -22,6 +23,7 @@ impl TaskSet {
                 named(&["none", "left", "right", "down", "up"])
             }
             Self::Combat(set) => combat_actions(set),
+            Self::Foreign(set) => set.action_names.clone(),
         }
     }
 }

@@ -3,6 +3,7 @@
 use crate::{
     Environment, EnvironmentOptions, Spec, UnknownName,
     combat::{Combat, CombatSet, Team, TeamError, translation::Translation},
+    foreign::{ForeignSet, ForeignTask, NO_TASKS, Nowhere},
     matrix_game::MatrixGame,
     particle::{CooperativeNavigation, DIRECTIONS, PredatorPrey, PredatorPreyReward},
 };
@@ -28,7 +29,12 @@ pub enum TaskSet {
     PredatorPreyPro,
     /// StarCraft micro-combat.
     Combat(CombatSet),
+    /// Tasks whose worlds others made; a run's configuration says which there are.
+    Foreign(&'static ForeignSet),
 }
+
+/// What the set of tasks is called whose worlds a Python function makes.
+pub const PYTHON: &str = "python";
 
 /// Tasks are trained on or kept for zero-shot evaluation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -70,6 +76,8 @@ pub enum Task {
         /// The opponent's.
         enemies: Team,
     },
+    /// A task whose world others made.
+    Foreign(&'static ForeignTask),
 }
 
 /// Between the teams of a battle's name, where they differ.
@@ -97,7 +105,7 @@ pub enum TaskError {
 }
 
 impl TaskSet {
-    /// Every task set.
+    /// Every task set that comes with the program.
     pub const ALL: [Self; 8] = [
         Self::MatrixGame,
         Self::CooperativeNavigation,
@@ -124,6 +132,7 @@ impl TaskSet {
             (Self::PredatorPreyPro, Split::Testing) => hunts(PredatorPreyReward::Pro, TESTING_HUNTS),
             (Self::Combat(set), Split::Training) => battles(set, &set.teams()[..set.n_training()]),
             (Self::Combat(set), Split::Testing) => battles(set, &set.teams()[set.n_training()..]),
+            (Self::Foreign(set), split) => set.tasks(split).iter().map(Task::Foreign).collect(),
         }
     }
 
@@ -152,7 +161,7 @@ impl TaskSet {
             Ok(Task::PredatorPrey { predators, prey, reward })
         };
         match self {
-            Self::MatrixGame => Err(unknown.into()),
+            Self::MatrixGame | Self::Foreign(_) => Err(unknown.into()),
             Self::CooperativeNavigation => match sizes("navigation") {
                 Some((n, landmarks)) if n == landmarks => {
                     Ok(Task::CooperativeNavigation { n: in_range(n, "agents")? })
@@ -177,6 +186,9 @@ impl TaskSet {
         match self {
             Self::MatrixGame | Self::Combat(_) => true,
             Self::CooperativeNavigation | Self::PredatorPrey | Self::PredatorPreyPro => false,
+            Self::Foreign(set) => {
+                !set.training.is_empty() && set.training.iter().all(|task| task.spec.has_wins)
+            }
         }
     }
 
@@ -184,7 +196,7 @@ impl TaskSet {
     pub fn has_prey(self) -> bool {
         match self {
             Self::PredatorPrey | Self::PredatorPreyPro => true,
-            Self::MatrixGame | Self::CooperativeNavigation | Self::Combat(_) => false,
+            Self::MatrixGame | Self::CooperativeNavigation | Self::Combat(_) | Self::Foreign(_) => false,
         }
     }
 
@@ -192,7 +204,7 @@ impl TaskSet {
     pub fn has_view_radius(self) -> bool {
         match self {
             Self::CooperativeNavigation | Self::PredatorPrey | Self::PredatorPreyPro => true,
-            Self::MatrixGame | Self::Combat(_) => false,
+            Self::MatrixGame | Self::Combat(_) | Self::Foreign(_) => false,
         }
     }
 
@@ -232,6 +244,7 @@ impl Task {
             Self::Combat { set, allies, enemies } => {
                 Box::new(Combat::new(set, [allies, enemies], options.combat))
             }
+            Self::Foreign(task) => Box::new(Nowhere(task)),
         }
     }
 
@@ -242,13 +255,14 @@ impl Task {
             Self::CooperativeNavigation { n } => CooperativeNavigation::spec(n),
             Self::PredatorPrey { predators, prey, .. } => PredatorPrey::spec(predators, prey),
             Self::Combat { set, allies, enemies } => Combat::spec(set, [allies, enemies]),
+            Self::Foreign(task) => task.spec,
         }
     }
 
     /// Where an action pushes or walks its agent, as a direction of the plane; `None` where entities have no places.
     pub fn direction(self, action: Action) -> Option<[f32; 2]> {
         match self {
-            Self::MatrixGame { .. } => None,
+            Self::MatrixGame { .. } | Self::Foreign(_) => None,
             Self::CooperativeNavigation { .. } | Self::PredatorPrey { .. } => {
                 DIRECTIONS.get(usize::from(action)).copied()
             }
@@ -271,6 +285,7 @@ impl fmt::Display for TaskSet {
             Self::PredatorPrey => "predator-prey",
             Self::PredatorPreyPro => "predator-prey-pro",
             Self::Combat(set) => return set.fmt(f),
+            Self::Foreign(_) => PYTHON,
         })
     }
 }
@@ -301,6 +316,7 @@ impl fmt::Display for Task {
                 };
                 write!(f, "{series}-{predators}-{prey}")
             }
+            Self::Foreign(task) => f.write_str(&task.name),
             Self::Combat { allies, enemies, .. } if allies == enemies => allies.fmt(f),
             Self::Combat { allies, enemies, .. } => write!(f, "{allies}{VERSUS}{enemies}"),
         }
@@ -311,6 +327,9 @@ impl FromStr for TaskSet {
     type Err = UnknownName;
 
     fn from_str(name: &str) -> Result<Self, UnknownName> {
+        if name == PYTHON {
+            return Ok(Self::Foreign(&NO_TASKS));
+        }
         UnknownName::look_up("task set", name, &Self::ALL)
     }
 }

@@ -4,10 +4,14 @@
 //! back end is one arm there.
 
 use rit_config::Config;
-use rit_env::{Embedded, EnvironmentFactory};
+use rit_env::{Embedded, EnvironmentFactory, TaskSet};
+use rit_foreign::{Launch, PythonWorlds};
 use std::sync::Arc;
 
 /// The factory of a configuration's worlds. Nothing is started before the first world is needed.
 pub fn factory(config: &Config) -> Arc<dyn EnvironmentFactory> {
+    if matches!(config.environment.task_set, TaskSet::Foreign(_)) {
+        return Arc::new(PythonWorlds::new(Launch::of(&config.environment)));
+    }
     Arc::new(Embedded(config.environment_options()))
 }

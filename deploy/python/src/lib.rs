@@ -29,7 +29,9 @@ impl NativePolicy {
     #[staticmethod]
     fn load(py: Python<'_>, path: PathBuf) -> PyResult<Self> {
         let loaded = py.detach(|| TrainedPolicy::load(&path));
-        loaded.map(|policy| Self(Mutex::new(policy))).map_err(|error| WeightsError::new_err(error.to_string()))
+        loaded
+            .map(|policy| Self(Mutex::new(policy)))
+            .map_err(|error| WeightsError::new_err(error.to_string()))
     }
 
     /// What the weights file says of itself: JSON.
@@ -94,7 +96,9 @@ fn refused(error: impl fmt::Display) -> PyErr {
 fn observation(seen: &Seen, features: usize, n_actions: usize) -> PyResult<Observation> {
     let (episode, n, m, entities, observable, available, _) = seen;
     if n > m {
-        return Err(refused(format!("episode {episode}: {n} agents of {m} entities; agents are entities too")));
+        return Err(refused(format!(
+            "episode {episode}: {n} agents of {m} entities; agents are entities too"
+        )));
     }
     for (what, found, expected) in [
         ("features", entities.len(), 4 * m * features),

@@ -2,7 +2,7 @@
 
 import re
 
-from conftest import REPOSITORY
+from conftest import REPOSITORY, rit
 
 PAGE = (REPOSITORY / "deploy/python/README.md").read_text()
 
@@ -21,3 +21,19 @@ def test_a_trained_policy(matrix_run, tmp_path, monkeypatch):
     for code in snippets("A trained policy"):
         exec(compile(code, "README.md", "exec"), names)
     assert names["actions"].shape == (2,) and names["utilities"].shape == (2, 3) and names["tasks"].shape == (2, 32)
+
+
+def test_your_own_environment(tmp_path, monkeypatch):
+    """The page's module and experiment, and the commands that it gives, in a folder of their own."""
+    module, _ = snippets("Your own environment")
+    (experiment,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
+    (commands,) = [block for block in re.findall(r"```\n(rit .*?)```", PAGE, re.DOTALL) if "gather" in block]
+    (tmp_path / "my_worlds.py").write_text(module)
+    (tmp_path / "gather.toml").write_text(experiment)
+    monkeypatch.chdir(tmp_path)
+    for command in commands.splitlines():
+        arguments = command.split()[1:]
+        # A page's worth of steps takes minutes of a busy machine; whether it learns is another test's.
+        arguments = ["2k" if argument == "20k" else argument for argument in arguments]
+        rit(*arguments)
+    assert (tmp_path / "runs/gather-1/summary.json").exists()

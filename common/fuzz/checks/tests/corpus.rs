@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests are tests too")]
 
-use rit_fuzz_checks::{checkpoint::Run, config, frame};
+use rit_fuzz_checks::{checkpoint::Run, config, frame, worker};
 use std::{
     fs,
     panic::{self, AssertUnwindSafe},
@@ -33,6 +33,11 @@ fn frames() {
 fn checkpoints() {
     let run = Run::new().unwrap();
     replay("checkpoint", &run.seeds(), |input| run.check(input));
+}
+
+#[test]
+fn workers() {
+    replay("worker", &worker::seeds(), worker::check);
 }
 
 #[test]

@@ -181,7 +181,7 @@ fn a_script_made_for_other_tasks_says_so() {
         assert_eq!(Script::Still.check(set), Ok(()));
         let found = [Script::NearestAssignment, Script::Chase].map(|script| script.check(set).is_ok());
         let expected = match set {
-            TaskSet::MatrixGame | TaskSet::Combat(_) => [false, false],
+            TaskSet::MatrixGame | TaskSet::Combat(_) | TaskSet::Foreign(_) => [false, false],
             TaskSet::CooperativeNavigation => [true, false],
             TaskSet::PredatorPrey | TaskSet::PredatorPreyPro => [false, true],
         };
