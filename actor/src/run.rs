@@ -95,6 +95,9 @@ pub enum ActorError {
     /// The learner's configuration means nothing here.
     #[error("the learner's configuration cannot be used: {0}; use the same build")]
     Config(#[from] rit_config::ConfigError),
+    /// What the run's environments need is not on this host.
+    #[error(transparent)]
+    Worlds(#[from] rit_worlds::Unavailable),
     /// What the learner says of its run is not whole.
     #[error("the learner's run has no number of 16 bytes; use the same build")]
     RunId,
@@ -143,6 +146,7 @@ impl ActorError {
             Self::Refused(_)
             | Self::Replaced(_)
             | Self::Config(_)
+            | Self::Worlds(_)
             | Self::RunId
             | Self::Random(_)
             | Self::Model(_)
@@ -259,6 +263,7 @@ impl Actor {
         *joined = true;
         let Welcome { actor, run_id, config } = welcome;
         let config: Config = resolve(&config, "the learner's configuration", &[])?;
+        rit_worlds::check(&config)?;
         let layout = PayloadLayout::new(config.dims());
 
         let (leases, lease_queue) = mpsc::channel(1);

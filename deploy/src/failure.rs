@@ -181,6 +181,7 @@ impl From<ActorError> for Failure {
             | ActorError::Address(_)
             | ActorError::Refused(_)
             | ActorError::Config(_)
+            | ActorError::Worlds(_)
             | ActorError::RunId
             | ActorError::Model(_) => Self::input(error),
             error if error.is_permanent() => Self::Incompatible(error.into()),

@@ -26,6 +26,7 @@ mod report;
 mod runs;
 mod shutdown;
 mod soak;
+mod starcraft;
 mod supervisor;
 mod train;
 mod usage;
@@ -39,7 +40,7 @@ use std::process::ExitCode;
 
 fn main() -> ExitCode {
     child::take_name();
-    let cli = match Cli::try_parse() {
+    let cli = match Cli::try_parse_from(starcraft::translate_game_options(std::env::args_os())) {
         Ok(cli) => cli,
         Err(error) => return usage::report(&error),
     };
@@ -76,6 +77,9 @@ async fn run(cli: Cli) -> Result<ExitCode, Failure> {
         Command::Certificates(options) => certificates::run(&options),
         Command::Env { command: EnvCommand::Check(options) } => python_worlds::check(&options),
         Command::Runs(options) => runs::run(&options),
+        Command::StarcraftEndpoint(options) => starcraft::endpoint(options, logs).await,
+        Command::StarcraftCheck(options) => starcraft::check(&options),
+        Command::StarcraftGame(options) => Err(starcraft::game(&options)),
         Command::Experiments => experiments::print(),
         Command::Completions { shell } => {
             let mut script = Vec::new();

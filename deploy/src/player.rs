@@ -1,8 +1,8 @@
 //! Who plays an evaluation or a picture, and what: `--policy`, `--run` and `--experiment`.
 
-use crate::{cli::PlayOptions, experiments, failure::Failure};
+use crate::{cli::PlayOptions, experiments, failure::Failure, output};
 use rit_algo::{Acting, Model};
-use rit_config::{Config, RunDir};
+use rit_config::{Config, RunDir, resolve, set};
 use rit_env::Script;
 use rit_episode::{Policy, RunSeed};
 use rit_learner::{checkpoint, trainer::evaluation_seed};
@@ -61,6 +61,15 @@ impl Player {
     /// # Errors
     /// When something is missing, unknown, or does not go together.
     pub fn new(options: &PlayOptions) -> Result<Self, Failure> {
+        let player = Self::of_policy(options)?;
+        if let Some(notice) = rit_worlds::check(&player.config).map_err(Failure::input)? {
+            // For people's eyes alone.
+            let _ = output::say(&notice);
+        }
+        Ok(player)
+    }
+
+    fn of_policy(options: &PlayOptions) -> Result<Self, Failure> {
         match options.policy.strip_prefix(SCRIPT) {
             Some(name) => Self::script(name.parse()?, options),
             None if options.policy == CHECKPOINT => Self::checkpoint(options),
@@ -93,6 +102,7 @@ impl Player {
                 )));
             }
         };
+        let config = with_backend(config, options)?;
         script.check(config.environment.task_set)?;
         Ok(Self { name: format!("{SCRIPT}{script}"), config, policy: Box::new(script), weights_digest: None })
     }
@@ -109,8 +119,16 @@ impl Player {
             )));
         };
         let Trained { config, model, params } = Trained::load(run)?;
+        let config = with_backend(config, options)?;
         let policy = Box::new(Acting::new(&model, &params[model.acting()]));
         let weights_digest = Some(weights_file::digest(&params));
         Ok(Self { name: CHECKPOINT.to_owned(), config, policy, weights_digest })
     }
+}
+
+/// The configuration, played where these options say.
+fn with_backend(config: Config, options: &PlayOptions) -> Result<Config, Failure> {
+    let Some(backend) = &options.backend else { return Ok(config) };
+    let setting = set(&format!("environment.backend={backend}"))?;
+    Ok(resolve(&config.to_toml()?, "the configuration", &[setting])?)
 }

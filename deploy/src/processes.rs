@@ -27,8 +27,15 @@ pub async fn learner(options: LearnerOptions, logs: LogOptions) -> Result<ExitCo
     owned.notices().iter().for_each(|notice| tracing::warn!("{notice}"));
     let shutdown = shutdown::requested(options.supervised);
     let run_dir = owned.run_dir().clone();
-    let ended = rit_learner::run(run_dir, config, set_log, shutdown).instrument(span).await;
-    let failed = match ended.map_err(Failure::from) {
+    let ended = match rit_worlds::check(&config).map_err(Failure::input) {
+        Ok(notice) => {
+            notice.iter().for_each(|notice| tracing::warn!("{notice}"));
+            let running = rit_learner::run(run_dir, config, set_log, shutdown).instrument(span);
+            running.await.map_err(Failure::from)
+        }
+        Err(failure) => Err(failure),
+    };
+    let failed = match ended {
         Ok(summary) => {
             let (digest, env_steps) = (summary.weights_digest, summary.progress.env_steps);
             tracing::info!(digest, env_steps, ended = %summary.ended, "the run is over");

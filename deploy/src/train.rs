@@ -24,7 +24,12 @@ use tracing::Instrument as _;
 pub async fn run(options: TrainOptions, logs: LogOptions) -> Result<ExitCode, Failure> {
     let Prepared { owned, config, said } = prepare(&options.config)?;
     let started = refuse_no_actors(&config)
-        .and_then(|()| logs.start_in(&owned.run_dir().logs().join("train.log"), "train"));
+        .and_then(|()| rit_worlds::check(&config).map_err(Failure::input))
+        .and_then(|notice| {
+            // For people's eyes alone.
+            notice.iter().for_each(|notice| drop(output::say(notice)));
+            logs.start_in(&owned.run_dir().logs().join("train.log"), "train")
+        });
     let span = match started {
         Ok(span) => span,
         Err(failure) => {

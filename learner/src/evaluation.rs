@@ -200,6 +200,8 @@ impl Evaluator {
             };
             results.push(result);
         }
+        // The next evaluation may be long in coming.
+        self.factory.rest();
         Ok(Some(results))
     }
 

@@ -34,6 +34,7 @@ pub struct Config {
     pub actors: Actors,
     pub learner: Learner,
     pub web: Web,
+    pub starcraft: StarCraft,
 }
 
 /// `[environment]`.
@@ -42,6 +43,7 @@ pub struct Config {
 #[allow(missing_docs, reason = "presets/all.toml documents every key, for users too")]
 pub struct Environment {
     pub task_set: TaskSet,
+    pub backend: Backend,
     pub training_tasks: Vec<String>,
     pub testing_tasks: Vec<String>,
     #[serde(serialize_with = "number::shortest")]
@@ -74,6 +76,16 @@ pub struct World {
     pub is_reproducible: bool,
 }
 
+/// Where environments play.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Backend {
+    /// In the processes of the run.
+    Embedded,
+    /// In games of StarCraft II, which actors start and speak to.
+    Starcraft,
+}
+
 /// Whether armies face each other at a random angle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -84,6 +96,17 @@ pub enum SpawnRotate {
     Always,
     /// Never.
     Never,
+}
+
+impl SpawnRotate {
+    /// Whether they do; as the task set has it where `None`.
+    pub fn rotates(self) -> Option<bool> {
+        match self {
+            Self::Published => None,
+            Self::Always => Some(true),
+            Self::Never => Some(false),
+        }
+    }
 }
 
 /// `[algorithm]`.
@@ -289,6 +312,18 @@ pub struct Tls {
     pub client_ca: String,
 }
 
+/// `[starcraft]`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs, reason = "presets/all.toml documents every key, for users too")]
+pub struct StarCraft {
+    pub map: String,
+    pub base_build: u32,
+    pub data_version: String,
+    pub custom_types: u32,
+    pub timeout_ms: u64,
+}
+
 /// `[web]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -452,15 +487,15 @@ impl Config {
     pub fn environment_options(&self) -> EnvironmentOptions {
         let Environment { view_radius, approach_shaping, spawn_rotate, stats, enemy_medivac, .. } =
             self.environment;
-        let spawn_rotate = match spawn_rotate {
-            SpawnRotate::Published => None,
-            SpawnRotate::Always => Some(true),
-            SpawnRotate::Never => Some(false),
-        };
         EnvironmentOptions {
             view_radius: view_radius.is_finite().then_some(view_radius),
             approach_shaping,
-            combat: CombatOptions { spawn_rotate, stats, enemy_medivac, mirror: false },
+            combat: CombatOptions {
+                spawn_rotate: spawn_rotate.rotates(),
+                stats,
+                enemy_medivac,
+                mirror: false,
+            },
         }
     }
 
@@ -555,6 +590,9 @@ impl Config {
             ("learner.shards", self.learner.shards.into(), 1.0, 256.0),
             ("learner.threads", self.learner.threads.into(), 1.0, 256.0),
             ("learner.metrics_every_env_steps", self.learner.metrics_every_env_steps.into(), 1.0, STEPS),
+            ("starcraft.base_build", u64::from(self.starcraft.base_build).into(), 0.0, 1e9),
+            ("starcraft.custom_types", u64::from(self.starcraft.custom_types).into(), 0.0, 1e9),
+            ("starcraft.timeout_ms", self.starcraft.timeout_ms.into(), 1000.0, 3_600_000.0),
             ("learner.stall_timeout_ms", self.learner.stall_timeout_ms.into(), 1000.0, 86_400_000.0),
         ]
     }

@@ -75,6 +75,20 @@ pub enum ConfigError {
         /// The task set.
         task_set: TaskSet,
     },
+    /// Real games of a task set that has none.
+    #[error("environment.backend = \"starcraft\" plays combat, and {task_set} is none; leave it out")]
+    NoBattles {
+        /// The task set.
+        task_set: TaskSet,
+    },
+    /// A key that changes nothing where the environments play.
+    #[error("{key} means nothing with environment.backend = {backend:?}; leave it out")]
+    NotOfBackend {
+        /// The key.
+        key: &'static str,
+        /// Where they play.
+        backend: &'static str,
+    },
     /// An end that never comes.
     #[error(
         "training.until = \"{until}\": the tasks of {task_set} know no winning, so that is never reached; write \

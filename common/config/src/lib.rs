@@ -20,8 +20,8 @@ mod run_place;
 mod saved;
 
 pub use config::{
-    Actors, Algorithm, Checkpoints, Config, Environment, Evaluation, Learner, Network, OptimizerName,
-    SpawnRotate, Tls, Training, Until, Web, WebListen, World,
+    Actors, Algorithm, Backend, Checkpoints, Config, Environment, Evaluation, Learner, Network,
+    OptimizerName, SpawnRotate, StarCraft, Tls, Training, Until, Web, WebListen, World,
 };
 pub use error::ConfigError;
 pub use foreign::{PythonAsked, python_answered, python_asked};

@@ -1,6 +1,6 @@
 //! From what a person typed to a [`Config`].
 
-use crate::{Config, ConfigError, Environment, SpawnRotate, Until, foreign, keys, method_keys};
+use crate::{Backend, Config, ConfigError, Environment, SpawnRotate, Until, foreign, keys, method_keys};
 use rit_algo::{Method, Regime};
 use rit_env::{
     TaskSet,
@@ -62,6 +62,7 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
             }
         }
     }
+    check_backend(&config)?;
     let is_combat = matches!(task_set, TaskSet::Combat(_));
     let meaningless = [
         ("environment.spawn_rotate", *spawn_rotate != SpawnRotate::Published && !is_combat),
@@ -78,6 +79,36 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
     }
     config.model().validate()?;
     Ok(config)
+}
+
+/// What plays in real games, and what only the simulator knows, or only they.
+fn check_backend(config: &Config) -> Result<(), ConfigError> {
+    let Environment { task_set, backend, stats, enemy_medivac, .. } = config.environment;
+    let starcraft = &config.starcraft;
+    let (name, meaningless) = match backend {
+        Backend::Starcraft if !matches!(task_set, TaskSet::Combat(_)) => {
+            return Err(ConfigError::NoBattles { task_set });
+        }
+        Backend::Starcraft => (
+            "starcraft",
+            vec![
+                ("environment.stats", stats != StatsVersion::default()),
+                ("environment.enemy_medivac", enemy_medivac != ScriptedMedivac::default()),
+            ],
+        ),
+        Backend::Embedded => (
+            "embedded",
+            vec![
+                ("starcraft.base_build", starcraft.base_build != 0),
+                ("starcraft.data_version", !starcraft.data_version.is_empty()),
+                ("starcraft.custom_types", starcraft.custom_types != 0),
+            ],
+        ),
+    };
+    match meaningless.into_iter().find(|(_, is_set)| *is_set) {
+        Some((key, _)) => Err(ConfigError::NotOfBackend { key, backend: name }),
+        None => Ok(()),
+    }
 }
 
 /// One `section.key=value` of the command line: one key, whatever the value holds.
@@ -112,7 +143,7 @@ pub fn all_keys() -> Vec<String> {
 }
 
 /// Keys, or sections, that a run may change when it goes on: no weight follows from them.
-const FREE: [&str; 15] = [
+const FREE: [&str; 16] = [
     "environment.environments_per_worker",
     "environment.interpreter",
     "environment.timeout_ms",
@@ -128,6 +159,7 @@ const FREE: [&str; 15] = [
     "learner.metrics_every_env_steps",
     "learner.stall_timeout_ms",
     "web",
+    "starcraft",
 ];
 
 /// Keys that a running learner can change. Of these `algorithm.epsilon_finish` changes the

@@ -12,6 +12,9 @@ use toml::{Table, Value};
 /// What this build writes. Raise it when what a key means changes.
 const FORMAT_VERSION: i64 = 1;
 
+/// Keys of which builds that did not know them did what the default says, so that it is no guess.
+const KNOWN_SINCE: [&str; 1] = ["environment.backend"];
+
 /// Its key, the first of the file.
 const KEY: &str = "format_version";
 
@@ -43,7 +46,8 @@ pub(crate) fn resolve_saved(text: &str, settings: &[Table]) -> Result<Saved, Con
     let text = toml::to_string(&table).map_err(|error| ConfigError::Value(error.to_string()))?;
     let saved = resolve(&text, CONFIG, &[])?;
     let missing: Vec<String> = flat(&saved)?.into_keys().filter(|key| !typed.contains(key)).collect();
-    if let Some(key) = missing.iter().find(|key| !is_free(key)) {
+    let is_a_guess = |key: &&String| !is_free(key) && !KNOWN_SINCE.contains(&key.as_str());
+    if let Some(key) = missing.iter().find(is_a_guess) {
         return Err(ConfigError::Incomplete { key: key.clone() });
     }
     if !missing.is_empty() {
@@ -102,6 +106,11 @@ mod tests {
         assert_eq!(
             notices(&without("keep")),
             ["config.toml lacks checkpoints.keep: today's defaults are taken"]
+        );
+        assert_eq!(
+            notices(&without("backend")),
+            ["config.toml lacks environment.backend: today's defaults are taken"],
+            "an older build had the embedded one alone"
         );
         assert_eq!(
             notices(&without("format_version")),

@@ -44,7 +44,7 @@ pub struct CombatOptions {
 
 impl CombatSet {
     /// Whether armies face each other at a random angle in the authors' code.
-    fn rotates(self) -> bool {
+    pub fn rotates(self) -> bool {
         self != Self::StalkersZealots
     }
 }
@@ -93,52 +93,67 @@ impl Combat {
 
     /// Shows the living units as the game would.
     fn look(&mut self) {
-        self.units.clear();
-        for unit in 0..self.world.len() {
-            if !self.world.is_alive(unit) {
-                continue;
-            }
-            let stats = self.world.stats(unit);
-            let [x, y] = self.world.position(unit);
-            self.units.push(RawUnit {
-                side: self.world.side(unit),
-                kind: self.world.kind(unit),
-                tag: unit as u64,
-                x: x as f32,
-                y: y as f32,
-                health: self.world.health(unit) as f32,
-                health_max: stats.health as f32,
-                shield: self.world.shield(unit) as f32,
-                shield_max: stats.shield as f32,
-                energy: self.world.energy(unit) as f32,
-                energy_max: stats.energy as f32,
-                weapon_cooldown: self.world.cooldown(unit) as f32,
-            });
-        }
+        raw_units(&self.world, &mut self.units);
     }
 
     fn give_orders(&mut self, actions: &[Action]) {
         for (agent, &action) in actions.iter().enumerate() {
             if let Some((unit, order)) = self.translation.order(agent, action) {
-                let order = match order {
-                    UnitOrder::Stop => Order::Stop,
-                    UnitOrder::Move(point) => Order::Move(point),
-                    UnitOrder::Attack(target) => Order::Attack(target as usize),
-                    UnitOrder::Heal(target) => Order::Heal(target as usize),
-                };
-                self.world.order(unit as usize, order);
+                give_order(&mut self.world, unit as usize, order);
             }
         }
     }
 }
 
-/// Draws distinct tags from 0 to 7 for so many units.
-fn draw_tags(count: usize, first: usize, rng: &mut Rng) -> [usize; TEAM_MAX] {
-    let mut tags: [usize; TEAM_MAX] = std::array::from_fn(|tag| first + tag);
-    for at in 0..count {
-        tags.swap(at, rng.random_range(at..TEAM_MAX));
+/// The living units of a world as the game would show them; their tags are their indices.
+pub fn raw_units(world: &World, to: &mut Vec<RawUnit>) {
+    to.clear();
+    for unit in 0..world.len() {
+        if !world.is_alive(unit) {
+            continue;
+        }
+        let stats = world.stats(unit);
+        let [x, y] = world.position(unit);
+        to.push(RawUnit {
+            side: world.side(unit),
+            kind: world.kind(unit),
+            tag: unit as u64,
+            x: x as f32,
+            y: y as f32,
+            health: world.health(unit) as f32,
+            health_max: stats.health as f32,
+            shield: world.shield(unit) as f32,
+            shield_max: stats.shield as f32,
+            energy: world.energy(unit) as f32,
+            energy_max: stats.energy as f32,
+            weapon_cooldown: world.cooldown(unit) as f32,
+        });
     }
-    tags
+}
+
+/// Gives a unit of a world an order; units are named as [`raw_units`] names them.
+pub fn give_order(world: &mut World, unit: usize, order: UnitOrder) {
+    let order = match order {
+        UnitOrder::Stop => Order::Stop,
+        UnitOrder::Move(point) => Order::Move(point),
+        UnitOrder::Attack(target) => Order::Attack(target as usize),
+        UnitOrder::Heal(target) => Order::Heal(target as usize),
+    };
+    world.order(unit, order);
+}
+
+/// What actions call the units of both teams: draws distinct numbers from 0 to 7 for the enemies, then from 8 to 15 for
+/// the allies. Returns the allies', then the enemies'.
+pub fn draw_tags([allies, enemies]: [Team; 2], rng: &mut Rng) -> [[usize; TEAM_MAX]; 2] {
+    let mut draw = |count: usize, first: usize| {
+        let mut tags: [usize; TEAM_MAX] = std::array::from_fn(|tag| first + tag);
+        for at in 0..count {
+            tags.swap(at, rng.random_range(at..TEAM_MAX));
+        }
+        tags
+    };
+    let enemy_tags = draw(enemies.len(), 0);
+    [draw(allies.len(), TEAM_MAX), enemy_tags]
 }
 
 impl Environment for Combat {
@@ -154,9 +169,7 @@ impl Environment for Combat {
         if self.options.mirror {
             spawn::send(&mut self.world, Side::Ally);
         }
-        let [allies, enemies] = self.teams.map(Team::len);
-        let enemy_tags = draw_tags(enemies, 0, rng);
-        let ally_tags = draw_tags(allies, TEAM_MAX, rng);
+        let [ally_tags, enemy_tags] = draw_tags(self.teams, rng);
         // Attack delays have a stream of their own.
         self.world.set_delays(Some(Rng::from_seed(rng.random())));
         self.look();

@@ -18,6 +18,9 @@ pub trait EnvironmentFactory: Send + Sync {
     /// When there can be none. The episode that it was for is lost.
     fn build(&self, task: Task) -> Result<Box<dyn Environment>, EnvironmentError>;
 
+    /// No world is needed for a while: what those that have ended left running may end as well.
+    fn rest(&self) {}
+
     /// Most worlds that may play at once; embedded ones are as many as anybody likes.
     fn worlds_max(&self) -> usize {
         usize::MAX

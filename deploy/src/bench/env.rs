@@ -1,4 +1,4 @@
-//! Environments alone: random joint actions, step and observe, task by task.
+//! Embedded environments alone: random joint actions, step and observe, task by task.
 
 use super::{Report, thread_cpu_s};
 use crate::failure::Failure;
@@ -15,11 +15,10 @@ pub(super) fn run(config: &Config, duration: Duration) -> Result<Report, Failure
     let tasks = config.tasks(Split::Training);
     let mut report = Report::new();
     let mut rates = Vec::new();
-    let factory = rit_worlds::factory(config);
-    for &task in &tasks {
-        let mut environment = factory.build(task).map_err(Failure::runtime)?;
+    for task in &tasks {
+        let mut environment = task.environment(config.environment_options());
         let rng = &mut RunSeed(1).stream(Stream::Environment, 0);
-        let spec = factory.spec(task);
+        let spec = task.spec();
         let mut observation = Observation::default();
         let mut actions: Vec<Action> = vec![0; spec.n_agents];
         // Cheap and uniform enough: what is measured is the environment.

@@ -37,28 +37,63 @@ static LATTICE: LazyLock<Vec<Point>> = LazyLock::new(|| {
     places.into_iter().map(|(_, _, place)| place).collect()
 });
 
-/// Fills a cleared world with both armies and sends the enemies to the allies' middle. Draws the angle (where the map
-/// is rotated), then the jitter of each ally group and of each enemy group.
-pub fn spawn(world: &mut World, set: CombatSet, [allies, enemies]: [Team; 2], rotate: bool, rng: &mut Rng) {
-    let [cosine, sine] = if rotate {
-        let angle = rng.random_range(0.0..2.0 * PI);
-        [libm::cos(angle), libm::sin(angle)]
-    } else {
-        // Allies at the left.
-        [-1.0, 0.0]
-    };
-    for (side, team, towards) in [(Side::Ally, allies, 1.0), (Side::Enemy, enemies, -1.0)] {
-        let [x, y] = [towards * cosine, towards * sine];
-        let middle = MAP_SIZE / 2.0;
-        for kind in set.types() {
-            let count = team.count(kind);
-            if count == 0 {
-                continue;
+/// Units of one type that come together.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Group {
+    /// Whose they are.
+    pub side: Side,
+    /// Their type.
+    pub kind: UnitType,
+    /// How many.
+    pub count: usize,
+    /// Where.
+    pub at: Point,
+}
+
+/// Where the groups of both armies come, the allies' first.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Layout {
+    /// The groups.
+    pub groups: Vec<Group>,
+    /// The direction from the enemies' army to the allies'.
+    facing: Point,
+}
+
+impl Layout {
+    /// Draws the angle (where the map is rotated), then the jitter of each ally group and of each enemy group.
+    pub fn draw(set: CombatSet, [allies, enemies]: [Team; 2], rotate: bool, rng: &mut Rng) -> Self {
+        let facing = if rotate {
+            let angle = rng.random_range(0.0..2.0 * PI);
+            [libm::cos(angle), libm::sin(angle)]
+        } else {
+            // Allies at the left.
+            [-1.0, 0.0]
+        };
+        let mut groups = Vec::new();
+        for (side, team, towards) in [(Side::Ally, allies, 1.0), (Side::Enemy, enemies, -1.0)] {
+            let middle = facing.map(|part| MAP_SIZE / 2.0 + ARMY_DISTANCE * towards * part);
+            for kind in set.types() {
+                let count = team.count(kind);
+                if count == 0 {
+                    continue;
+                }
+                let jitter = [rng.random_range(-JITTER..JITTER), rng.random_range(-JITTER..JITTER)];
+                groups.push(Group { side, kind, count, at: [middle[0] + jitter[0], middle[1] + jitter[1]] });
             }
-            let jitter = [rng.random_range(-JITTER..JITTER), rng.random_range(-JITTER..JITTER)];
-            let at = [middle + ARMY_DISTANCE * x + jitter[0], middle + ARMY_DISTANCE * y + jitter[1]];
-            place_group(world, side, kind, count, at, [-x, -y]);
         }
+        Self { groups, facing }
+    }
+}
+
+/// Fills a cleared world with both armies and sends the enemies to the allies' middle. Draws as [`Layout::draw`] does.
+pub fn spawn(world: &mut World, set: CombatSet, teams: [Team; 2], rotate: bool, rng: &mut Rng) {
+    let Layout { groups, facing: [x, y] } = Layout::draw(set, teams, rotate, rng);
+    for Group { side, kind, count, at } in groups {
+        let axis = match side {
+            Side::Ally => [-x, -y],
+            Side::Enemy => [x, y],
+        };
+        place_group(world, side, kind, count, at, axis);
     }
     send(world, Side::Enemy);
 }

@@ -227,6 +227,11 @@ impl Translation {
         self.rows.iter().filter(move |row| row.unit.side == side).map(|row| row.unit.tag)
     }
 
+    /// All units as they were last seen, the allies by their number, then the enemies by theirs; and whether they live.
+    pub fn units(&self) -> impl Iterator<Item = (&RawUnit, bool)> {
+        self.rows.iter().map(|row| (&row.unit, row.alive))
+    }
+
     /// Number of agents.
     pub fn n_agents(&self) -> usize {
         self.n_allies

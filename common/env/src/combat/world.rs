@@ -303,11 +303,11 @@ impl World {
 
     /// Gives an order, to be followed from the next tick on. A busy unit finishes first; one that winds up breaks
     /// off, unless the order is the one it follows. An order that the game would refuse is counted and changes
-    /// nothing.
-    pub fn order(&mut self, unit: usize, order: Order) {
+    /// nothing; says whether it was taken.
+    pub fn order(&mut self, unit: usize, order: Order) -> bool {
         if !self.alive[unit] || !self.is_possible(unit, order) {
             self.orders_refused += 1;
-            return;
+            return false;
         }
         if self.orders[unit] == order {
             self.pending[unit] = None;
@@ -316,6 +316,13 @@ impl World {
         } else {
             self.follow(unit, order);
         }
+        true
+    }
+
+    /// A unit dies at once, of nothing.
+    pub fn kill(&mut self, unit: usize) {
+        self.health[unit] = 0.0;
+        self.bury_the_dead();
     }
 
     fn is_possible(&self, unit: usize, order: Order) -> bool {

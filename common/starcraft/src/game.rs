@@ -1,0 +1,560 @@
+//! One game: from its start to battles in it.
+
+use crate::{
+    connection::{Connection, ConnectionError, shown},
+    error::StarCraftError,
+    installation::BUILD_MIN,
+    messages::{
+        Action, ActionRaw, ActionRawUnitCommand, DebugCommand, DebugCreateUnit, DebugGameState,
+        DebugKillUnit, Difficulty, InterfaceOptions, LocalMap, PlayerSetup, PlayerType, Point2D, Race,
+        RequestAction, RequestCreateGame, RequestData, RequestDebug, RequestGameInfo, RequestJoinGame,
+        RequestObservation, RequestPing, RequestQuit, RequestSaveReplay, RequestStep, ResponseCreateGame,
+        ResponseJoinGame, Status, Unit, action_raw, action_raw_unit_command::Target, debug_command::Command,
+        request::Request, request_join_game::Participation, response::Response, response_create_game,
+        response_join_game,
+    },
+    process::GameProcess,
+    unit_types::{CustomTypes, standard_kind},
+};
+use rit_env::combat::{
+    CombatSet, TICKS_PER_STEP,
+    spawn::Group,
+    translation::{CELLS, Pathing, RawUnit, UnitOrder},
+    world::{Point, Side},
+};
+use std::{
+    path::Path,
+    thread,
+    time::{Duration, Instant},
+};
+
+/// How long a game may take to come up, and from one attempt to speak to it to the next.
+const START_TIMEOUT: Duration = Duration::from_secs(120);
+const RETRY_EVERY: Duration = Duration::from_millis(250);
+
+/// Loops within which units that were created, or killed, must be there, or gone.
+const UNITS_WITHIN: u32 = 64;
+/// Loops of the first wait for them.
+const UNITS_FIRST: u32 = 2;
+/// Loops between the units' creation and the first orders.
+const SETTLE: u32 = 4;
+
+/// The engine stops at so many loops; a game is left before a battle could get there.
+const LOOPS_MAX: u32 = 1 << 19;
+
+/// The game's result of an action that is done.
+const SUCCESS: i32 = 1;
+
+/// Abilities of the game.
+const STOP: i32 = 4;
+const MOVE: i32 = 16;
+const ATTACK: i32 = 23;
+const HEAL: i32 = 386;
+
+/// What a game is to be made of.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Setup {
+    /// The set, whose race the opponent is of.
+    pub set: CombatSet,
+    /// The map's file, as the game is told it, and what it holds.
+    pub map: String,
+    /// The map's content.
+    pub map_data: Vec<u8>,
+    /// The first of the map's own unit types; 0 where it is to be found out.
+    pub custom_types: u32,
+    /// What the game's own randomness follows from.
+    pub random_seed: u32,
+    /// How long a response is waited for.
+    pub timeout: Duration,
+}
+
+/// A game that was joined, and can play battle after battle.
+#[derive(Debug)]
+pub struct Game {
+    connection: Connection,
+    /// `None` where somebody else has started it.
+    process: Option<GameProcess>,
+    custom: CustomTypes,
+    pathing: Pathing,
+    loops: u32,
+    /// Whether the opponent's units were put under control.
+    controls_enemy: bool,
+    /// Orders that the game has refused.
+    refused: u64,
+    /// Whether it was asked to quit.
+    quits: bool,
+    /// What it says of itself.
+    version: String,
+    build: u32,
+}
+
+impl Game {
+    /// Speaks to a game that was started, once it is up, and makes it ready for battles.
+    ///
+    /// # Errors
+    /// When it does not come up, or is not what it must be.
+    pub(crate) fn begin(mut process: GameProcess, setup: &Setup) -> Result<Self, StarCraftError> {
+        let (address, begun) = (process.address(), Instant::now());
+        let connection = loop {
+            match Connection::open(address, setup.timeout) {
+                Ok(connection) => break connection,
+                Err(last @ (ConnectionError::NotReady { .. } | ConnectionError::TimedOut { .. })) => {
+                    if let Some(ended) = process.ended() {
+                        return Err(ended);
+                    }
+                    if begun.elapsed() >= START_TIMEOUT {
+                        return Err(StarCraftError::NotUp { after: START_TIMEOUT, last });
+                    }
+                    thread::sleep(RETRY_EVERY);
+                }
+                Err(error) => return Err(error.into()),
+            }
+        };
+        Self::join(connection, Some(process), setup)
+    }
+
+    /// Makes a game ready that somebody has started, by a connection to it.
+    ///
+    /// # Errors
+    /// When it is not what it must be.
+    pub fn with(connection: Connection, setup: &Setup) -> Result<Self, StarCraftError> {
+        Self::join(connection, None, setup)
+    }
+
+    fn join(
+        mut connection: Connection,
+        process: Option<GameProcess>,
+        setup: &Setup,
+    ) -> Result<Self, StarCraftError> {
+        let (version, build) = check_version(&mut connection)?;
+        create(&mut connection, setup)?;
+        let pathing = look_at_the_map(&mut connection, setup)?;
+        let mut game = Self {
+            connection,
+            process,
+            custom: CustomTypes::row(setup.custom_types),
+            pathing,
+            loops: 0,
+            controls_enemy: false,
+            refused: 0,
+            quits: false,
+            version,
+            build,
+        };
+        if setup.custom_types == 0 {
+            game.custom = game.find_custom_types()?;
+        }
+        tracing::info!(version = game.version, build, custom = ?game.custom, "a game is ready");
+        Ok(game)
+    }
+
+    /// Its version, as it calls itself, and its build.
+    pub fn version(&self) -> (&str, u32) {
+        (&self.version, self.build)
+    }
+
+    /// The numbers of the map's own types.
+    pub fn custom_types(&self) -> &CustomTypes {
+        &self.custom
+    }
+
+    /// Which cells can be walked.
+    pub fn pathing(&self) -> &Pathing {
+        &self.pathing
+    }
+
+    /// Orders that it has refused so far.
+    pub fn orders_refused(&self) -> u64 {
+        self.refused
+    }
+
+    /// Whether it is too old for another battle of so many steps.
+    pub fn is_spent(&self, steps_max: usize) -> bool {
+        let battle = (TICKS_PER_STEP * steps_max) as u32 + UNITS_WITHIN * 2 + SETTLE;
+        self.loops + battle >= LOOPS_MAX
+    }
+
+    /// Asks for what [`Self::begin_battle`] needs first, so that several games get to it at once.
+    ///
+    /// # Errors
+    /// When it cannot be asked.
+    pub fn tell_to_begin(&mut self) -> Result<(), StarCraftError> {
+        Ok(self.connection.send(observation())?)
+    }
+
+    /// Takes [`Self::tell_to_begin`] back.
+    pub(crate) fn forget_beginning(&mut self) -> Result<(), StarCraftError> {
+        self.observed().map(drop)
+    }
+
+    /// Clears the map, creates these units, and sends the opponent's to the middle of the others. Returns all units as
+    /// they stand. [`Self::tell_to_begin`] comes before.
+    ///
+    /// # Errors
+    /// When the game does not do so.
+    pub fn begin_battle(&mut self, groups: &[Group]) -> Result<Vec<Unit>, StarCraftError> {
+        let left = self.observed()?;
+        self.clear(&left)?;
+        let create = groups.iter().map(|group| Command::CreateUnit(self.creation(group))).collect();
+        self.debug(create)?;
+        let wanted = groups.iter().map(|group| group.count).sum();
+        self.step_until(wanted)?;
+        if !self.controls_enemy {
+            self.toggle_enemy_control()?;
+            self.controls_enemy = true;
+        }
+        self.step(SETTLE)?;
+        let units = self.observe()?;
+        self.send_enemies(&units)?;
+        Ok(units)
+    }
+
+    /// Gives orders and runs one step of the environment; [`Self::finish_step`] gives what it led to.
+    ///
+    /// # Errors
+    /// When the game cannot be told.
+    pub fn begin_step(
+        &mut self,
+        orders: impl Iterator<Item = (u64, UnitOrder)>,
+    ) -> Result<(), StarCraftError> {
+        let actions = orders.map(|(unit, order)| command(&[unit], order)).collect();
+        self.connection.send(Request::Action(RequestAction { actions }))?;
+        self.connection.send(Request::Step(RequestStep { count: Some(TICKS_PER_STEP as u32) }))?;
+        Ok(self.connection.send(observation())?)
+    }
+
+    /// The units after a step.
+    ///
+    /// # Errors
+    /// When the game does not go on.
+    pub fn finish_step(&mut self) -> Result<Vec<Unit>, StarCraftError> {
+        let Response::Action(acted) = self.connection.receive()? else { return Err(odd("action")) };
+        let refused = acted.result.iter().filter(|&&result| result != SUCCESS).count();
+        if refused > 0 {
+            tracing::debug!(refused, results = ?acted.result, "the game refuses orders");
+            self.refused += refused as u64;
+        }
+        self.connection.receive()?;
+        self.observed()
+    }
+
+    /// The game's units as the translation takes them.
+    ///
+    /// # Errors
+    /// When one cannot be.
+    pub fn raw_units(&self, units: &[Unit], to: &mut Vec<RawUnit>) -> Result<(), StarCraftError> {
+        to.clear();
+        for unit in units {
+            let wrong = |what: String| StarCraftError::Unit { what };
+            let (side, kind) = match unit.owner() {
+                1 => (Side::Ally, self.custom.kind(unit.unit_type())),
+                2 => (Side::Enemy, standard_kind(unit.unit_type())),
+                // Nobody's: what the map is decorated with.
+                _ => continue,
+            };
+            let kind =
+                kind.ok_or_else(|| wrong(format!("type {} of player {}", unit.unit_type(), unit.owner())))?;
+            let pos = unit.pos.unwrap_or_default();
+            let numbers = [
+                pos.x(),
+                pos.y(),
+                unit.health(),
+                unit.health_max(),
+                unit.shield(),
+                unit.shield_max(),
+                unit.energy(),
+                unit.energy_max(),
+                unit.weapon_cooldown(),
+            ];
+            if !numbers.iter().all(|number| number.is_finite()) || unit.health_max() <= 0.0 {
+                return Err(wrong(format!("numbers {numbers:?} of a {kind:?}")));
+            }
+            let [x, y, health, health_max, shield, shield_max, energy, energy_max, weapon_cooldown] = numbers;
+            to.push(RawUnit {
+                side,
+                kind,
+                tag: unit.tag(),
+                x,
+                y,
+                health,
+                health_max,
+                shield,
+                shield_max,
+                energy,
+                energy_max,
+                weapon_cooldown,
+            });
+        }
+        Ok(())
+    }
+
+    /// The replay of all that was played in this game.
+    ///
+    /// # Errors
+    /// When the game gives none.
+    pub fn save_replay(&mut self) -> Result<Vec<u8>, StarCraftError> {
+        match self.connection.ask(Request::SaveReplay(RequestSaveReplay {}))? {
+            Response::SaveReplay(replay) => Ok(replay.data.unwrap_or_default()),
+            _ => Err(odd("save_replay")),
+        }
+    }
+
+    /// Asks the game to end; [`Self::quit`] waits for it.
+    pub(crate) fn ask_to_quit(&mut self) {
+        if !std::mem::replace(&mut self.quits, true)
+            && let Err(error) = self.connection.send(Request::Quit(RequestQuit {}))
+        {
+            tracing::debug!(%error, "a game could not be asked to quit");
+        }
+    }
+
+    /// Ends the game in order, and waits for its end.
+    pub fn quit(mut self) {
+        self.ask_to_quit();
+        if let Some(process) = self.process.take() {
+            process.quit();
+        }
+    }
+
+    fn clear(&mut self, units: &[Unit]) -> Result<(), StarCraftError> {
+        if units.is_empty() {
+            return Ok(());
+        }
+        let tag = units.iter().map(Unit::tag).collect();
+        self.debug(vec![Command::KillUnit(DebugKillUnit { tag })])?;
+        self.step_until(0)
+    }
+
+    /// Steps until there are so many units.
+    fn step_until(&mut self, wanted: usize) -> Result<(), StarCraftError> {
+        let (mut loops, mut count) = (0, UNITS_FIRST);
+        loop {
+            self.step(count)?;
+            loops += count;
+            let found = self.observe()?.len();
+            if found == wanted {
+                return Ok(());
+            }
+            if loops >= UNITS_WITHIN {
+                return Err(StarCraftError::Units { loops, found, wanted });
+            }
+            count = 1;
+        }
+    }
+
+    fn creation(&self, group: &Group) -> DebugCreateUnit {
+        let (owner, unit_type) = match group.side {
+            Side::Ally => (1, self.custom.number(group.kind)),
+            Side::Enemy => (2, group.kind.standard_id()),
+        };
+        DebugCreateUnit {
+            unit_type: Some(unit_type),
+            owner: Some(owner),
+            pos: Some(point(group.at)),
+            quantity: Some(group.count as u32),
+        }
+    }
+
+    /// Sends the opponent's units to the middle of the others, attacking what they meet. Where the game refuses, control
+    /// of them was toggled away by somebody before, and is toggled back.
+    fn send_enemies(&mut self, units: &[Unit]) -> Result<(), StarCraftError> {
+        let of = |owner: i32| units.iter().filter(move |unit| unit.owner() == owner);
+        let count = of(1).count().max(1) as f64;
+        let mean = |axis: fn(&crate::messages::Point) -> f32| {
+            of(1).filter_map(|unit| unit.pos.as_ref()).map(|pos| f64::from(axis(pos))).sum::<f64>() / count
+        };
+        let middle = [mean(crate::messages::Point::x), mean(crate::messages::Point::y)];
+        let target = Some(Target::TargetWorldSpacePos(point(middle)));
+        let unit_tags: Vec<u64> = of(2).map(Unit::tag).collect();
+        for attempt in 0..2 {
+            let order = ActionRawUnitCommand {
+                ability_id: Some(ATTACK),
+                target,
+                unit_tags: unit_tags.clone(),
+                queue_command: Some(false),
+            };
+            let request = Request::Action(RequestAction { actions: vec![action(order)] });
+            let Response::Action(acted) = self.connection.ask(request)? else { return Err(odd("action")) };
+            let Some(&result) = acted.result.iter().find(|&&result| result != SUCCESS) else { return Ok(()) };
+            if attempt == 1 {
+                return Err(StarCraftError::EnemyControl { result });
+            }
+            self.toggle_enemy_control()?;
+        }
+        Ok(())
+    }
+
+    fn toggle_enemy_control(&mut self) -> Result<(), StarCraftError> {
+        self.debug(vec![Command::GameState(DebugGameState::ControlEnemy.into())])
+    }
+
+    /// By their names in the game's data, or else by creating one of each that may be one and looking at it.
+    fn find_custom_types(&mut self) -> Result<CustomTypes, StarCraftError> {
+        let request = RequestData { unit_type_id: Some(true), ..RequestData::default() };
+        let Response::Data(data) = self.connection.ask(Request::Data(request))? else {
+            return Err(odd("data"));
+        };
+        if let Some(custom) = CustomTypes::by_name(&data.units) {
+            return Ok(custom);
+        }
+        let candidates = CustomTypes::candidates(&data.units);
+        let left = self.observe()?;
+        self.clear(&left)?;
+        let create = |(at, &id): (usize, &u32)| {
+            let place = [2.0 + 3.5 * (at % 8) as f64, 2.0 + 3.5 * (at / 8) as f64];
+            Command::CreateUnit(DebugCreateUnit {
+                unit_type: Some(id),
+                owner: Some(1),
+                pos: Some(point(place)),
+                quantity: Some(1),
+            })
+        };
+        self.debug(candidates.iter().enumerate().map(create).collect())?;
+        self.step(UNITS_FIRST)?;
+        let units = self.observe()?;
+        CustomTypes::by_looks(&units).ok_or_else(|| StarCraftError::UnitTypes {
+            tried: format!(
+                "names ending in _RL, and the looks of {} types numbered {:?} to {:?}",
+                candidates.len(),
+                candidates.first(),
+                candidates.last()
+            ),
+        })
+    }
+
+    fn debug(&mut self, commands: Vec<Command>) -> Result<(), StarCraftError> {
+        let debug = commands.into_iter().map(|command| DebugCommand { command: Some(command) }).collect();
+        self.connection.ask(Request::Debug(RequestDebug { debug }))?;
+        Ok(())
+    }
+
+    fn step(&mut self, count: u32) -> Result<(), StarCraftError> {
+        self.connection.ask(Request::Step(RequestStep { count: Some(count) }))?;
+        Ok(())
+    }
+
+    fn observe(&mut self) -> Result<Vec<Unit>, StarCraftError> {
+        self.connection.send(observation())?;
+        self.observed()
+    }
+
+    /// The units of both players in the observation that is on its way.
+    fn observed(&mut self) -> Result<Vec<Unit>, StarCraftError> {
+        let Response::Observation(seen) = self.connection.receive()? else { return Err(odd("observation")) };
+        if self.connection.status() != Status::InGame {
+            return Err(StarCraftError::Ended { status: format!("{:?}", self.connection.status()) });
+        }
+        let observation = seen.observation.unwrap_or_default();
+        self.loops = observation.game_loop();
+        let units = observation.raw_data.map(|raw| raw.units).unwrap_or_default();
+        Ok(units.into_iter().filter(|unit| matches!(unit.owner(), 1 | 2)).collect())
+    }
+}
+
+fn check_version(connection: &mut Connection) -> Result<(String, u32), StarCraftError> {
+    let Response::Ping(ping) = connection.ask(Request::Ping(RequestPing {}))? else {
+        return Err(odd("ping"));
+    };
+    let (version, build) = (shown(&ping.game_version()), ping.base_build());
+    if build < BUILD_MIN { Err(StarCraftError::Version { version, build }) } else { Ok((version, build)) }
+}
+
+/// Creates a game against a computer of the set's race, and joins it.
+fn create(connection: &mut Connection, setup: &Setup) -> Result<(), StarCraftError> {
+    let race = match setup.set {
+        CombatSet::Marines | CombatSet::MarinesMaraudersMedivacs => Race::Terran,
+        CombatSet::StalkersZealots | CombatSet::ColossiStalkersZealots => Race::Protoss,
+    };
+    let participant = PlayerSetup { r#type: Some(PlayerType::Participant.into()), ..PlayerSetup::default() };
+    let computer = PlayerSetup {
+        r#type: Some(PlayerType::Computer.into()),
+        race: Some(race.into()),
+        difficulty: Some(Difficulty::VeryHard.into()),
+    };
+    let request = RequestCreateGame {
+        local_map: Some(LocalMap {
+            map_path: Some(setup.map.clone()),
+            map_data: Some(setup.map_data.clone()),
+        }),
+        player_setup: vec![participant, computer],
+        realtime: Some(false),
+        random_seed: Some(setup.random_seed),
+        ..RequestCreateGame::default()
+    };
+    let failed = |request, error: String, details: &str| StarCraftError::Game {
+        request,
+        error,
+        details: shown(&details),
+        map: setup.map.clone(),
+    };
+    match connection.ask(Request::CreateGame(request))? {
+        Response::CreateGame(ResponseCreateGame { error: None, .. }) => {}
+        Response::CreateGame(created) => {
+            let error = response_create_game::Error::try_from(created.error.unwrap_or_default());
+            let name = error.map_or_else(|unknown| unknown.to_string(), |error| format!("{error:?}"));
+            return Err(failed("create_game", name, created.error_details()));
+        }
+        _ => return Err(odd("create_game")),
+    }
+    let request = RequestJoinGame {
+        options: Some(InterfaceOptions { raw: Some(true), score: Some(false) }),
+        participation: Some(Participation::Race(race.into())),
+    };
+    match connection.ask(Request::JoinGame(request))? {
+        Response::JoinGame(ResponseJoinGame { error: None, .. }) => Ok(()),
+        Response::JoinGame(joined) => {
+            let error = response_join_game::Error::try_from(joined.error.unwrap_or_default());
+            let name = error.map_or_else(|unknown| unknown.to_string(), |error| format!("{error:?}"));
+            Err(failed("join_game", name, joined.error_details()))
+        }
+        _ => Err(odd("join_game")),
+    }
+}
+
+/// The map must have the size that battles are made for; returns which of its cells can be walked.
+fn look_at_the_map(connection: &mut Connection, setup: &Setup) -> Result<Pathing, StarCraftError> {
+    let Response::GameInfo(info) = connection.ask(Request::GameInfo(RequestGameInfo {}))? else {
+        return Err(odd("game_info"));
+    };
+    let raw = info.start_raw.unwrap_or_default();
+    let size = raw.map_size.unwrap_or_default();
+    let cells = CELLS as i32;
+    if (size.x(), size.y()) != (cells, cells) {
+        let map = Path::new(&setup.map).display().to_string();
+        return Err(StarCraftError::MapSize { map, x: size.x(), y: size.y() });
+    }
+    let grid = raw.pathing_grid.unwrap_or_default();
+    Ok(Pathing::read(grid.bits_per_pixel().unsigned_abs(), grid.data())?)
+}
+
+fn observation() -> Request {
+    Request::Observation(RequestObservation::default())
+}
+
+fn point([x, y]: Point) -> Point2D {
+    Point2D { x: Some(x as f32), y: Some(y as f32) }
+}
+
+fn action(command: ActionRawUnitCommand) -> Action {
+    Action { action_raw: Some(ActionRaw { action: Some(action_raw::Action::UnitCommand(command)) }) }
+}
+
+fn command(units: &[u64], order: UnitOrder) -> Action {
+    let (ability, target) = match order {
+        UnitOrder::Stop => (STOP, None),
+        UnitOrder::Move(to) => (MOVE, Some(Target::TargetWorldSpacePos(point(to)))),
+        UnitOrder::Attack(tag) => (ATTACK, Some(Target::TargetUnitTag(tag))),
+        UnitOrder::Heal(tag) => (HEAL, Some(Target::TargetUnitTag(tag))),
+    };
+    action(ActionRawUnitCommand {
+        ability_id: Some(ability),
+        target,
+        unit_tags: units.to_vec(),
+        queue_command: Some(false),
+    })
+}
+
+/// [`Connection`] has compared the names, so this does not come about.
+fn odd(request: &'static str) -> StarCraftError {
+    ConnectionError::Garbage { request, reason: "it answers another request".into() }.into()
+}
