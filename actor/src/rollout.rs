@@ -2,6 +2,7 @@
 
 use crate::{
     losses::{Losses, LostLeases},
+    run::cpu_ms,
     sink::{EpisodeSink, SinkError},
     weights::{Weights, WeightsError},
 };
@@ -101,7 +102,8 @@ impl Roller {
                 }
             }
             self.sink.flush(&give_up)?;
-            let done = Message::Done(Done { lease: lease.lease, losses: losses.to_messages() });
+            let done =
+                Message::Done(Done { lease: lease.lease, losses: losses.to_messages(), cpu_ms: cpu_ms() });
             if let Some(lost) = self.lost_leases.note(losses, brought_any) {
                 // In this order, so that no other lease comes.
                 for last in [Message::Leaving(Leaving {}), done] {

@@ -359,12 +359,17 @@ async fn converse(
                 said = true;
                 actor_message::Message::Leaving(Leaving {})
             }
-            _ = heartbeat.tick() => actor_message::Message::Heartbeat(Heartbeat {}),
+            _ = heartbeat.tick() => actor_message::Message::Heartbeat(Heartbeat { cpu_ms: cpu_ms() }),
         };
         if outbox.send(say(message)).await.is_err() {
             return Err(gone(&"it does not listen any more"));
         }
     }
+}
+
+/// Milliseconds of processor time that this process has taken.
+pub(crate) fn cpu_ms() -> u64 {
+    (1000.0 * rit_record::cpu_seconds()) as u64
 }
 
 fn say(message: actor_message::Message) -> ActorMessage {

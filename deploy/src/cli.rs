@@ -4,7 +4,7 @@ use crate::logging::LogOptions;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use rit_config::{WHOLE_MAX, count};
 use rit_env::combat::{StatsVersion, world::ScriptedMedivac};
-use rit_learner::run_handle::EPISODES_MAX;
+use rit_learner::{checkpoint::Which, run_handle::EPISODES_MAX};
 use rit_proto::transport::{Address, CredentialFiles, Credentials, CredentialsError};
 use std::{
     ffi::OsString,
@@ -31,6 +31,8 @@ pub enum Command {
     Learner(LearnerOptions),
     /// Start one actor; it joins the learner of a run directory, or of an address
     Actor(ActorOptions),
+    /// Run what a file compares: every combination of its axes with every seed, here or as jobs of a cluster
+    Sweep(SweepOptions),
     /// Roll greedy episodes with a run's newest checkpoint, or with a script
     Evaluate(EvaluateOptions),
     /// Draw episodes of a run's newest checkpoint, or of a script
@@ -121,6 +123,102 @@ pub struct TrainOptions {
     /// Print the summary as JSON, and no progress
     #[arg(long)]
     pub json: bool,
+    /// End in order when standard input ends: whoever started this process has gone
+    #[arg(long, hide = true)]
+    pub supervised: bool,
+}
+
+/// The options of `rit train` with these arguments.
+///
+/// # Errors
+/// When they are none, which is a fault of the program.
+pub fn train(arguments: &[String], json: bool) -> Result<TrainOptions, clap::Error> {
+    let json = json.then(|| "--json".to_owned());
+    let cli =
+        Cli::try_parse_from(["rit".to_owned()].into_iter().chain(arguments.iter().cloned()).chain(json))?;
+    match cli.command {
+        Command::Train(options) => Ok(options),
+        _ => Err(clap::Error::new(clap::error::ErrorKind::InvalidSubcommand)),
+    }
+}
+
+/// How the file of a sweep looks.
+const SWEEP_FILE: &str = "\
+The file:
+  experiment = \"matrix-game\"               # a name of `rit experiments`, or a .toml file
+  seeds = [1, 2, 3]
+  [axes]                                   # every combination is a cell, once with every seed
+  \"algorithm.name\" = [\"rit\", \"vdn-attn\"]  # any key; or \"experiment\" = [..] in place of the one above
+  [set]                                    # what all cells set
+  \"training.t_max\" = 4000
+  [[exclude]]                              # cells that are left out
+  \"algorithm.name\" = \"vdn-attn\"
+  seed = 3
+  [[override]]                             # what some cells set beyond that
+  where = { \"algorithm.name\" = \"rit\" }
+  set = { \"algorithm.lr\" = 0.001 }
+
+Each run lies in DIR/runs/NAME. Started again, the same command leaves out what is finished and goes on with the rest.
+Exit codes: 0 all cells are finished, 1 some are not, 2 something given was wrong, 130 interrupted.";
+
+#[derive(Args, Debug)]
+#[command(args_conflicts_with_subcommands = true, after_help = SWEEP_FILE)]
+pub struct SweepOptions {
+    #[command(subcommand)]
+    pub command: Option<SweepCommand>,
+    /// File that says what is compared
+    #[arg(value_name = "FILE.toml")]
+    pub file: Option<PathBuf>,
+    /// Folder of the sweep: new, empty, or of the same sweep
+    #[arg(long, value_name = "DIR")]
+    pub dir: Option<PathBuf>,
+    /// Runs side by side, which share the processors; without it one for every two processors. On a cluster: at most so
+    /// many at once
+    #[arg(long, value_name = "N", value_parser = within::<usize>(1, 256))]
+    pub jobs: Option<usize>,
+    /// Run nothing: list the runs, how each stands, and what they will take by what finished ones took
+    #[arg(long)]
+    pub dry_run: bool,
+    /// Write an array job for Slurm in place of running: each index runs one cell
+    #[arg(long, value_name = "OUT.sbatch", conflicts_with_all = ["dry_run", "kubernetes", "cell"])]
+    pub slurm: Option<PathBuf>,
+    /// Write an Indexed Job for Kubernetes in place of running
+    #[arg(long, value_name = "OUT.yaml", conflicts_with_all = ["dry_run", "cell"])]
+    pub kubernetes: Option<PathBuf>,
+    /// Queue of Kueue that the job waits in
+    #[arg(long, value_name = "NAME", requires = "kubernetes", value_parser = label)]
+    pub queue: Option<String>,
+    /// Write over the file of --slurm or --kubernetes
+    #[arg(long)]
+    pub force: bool,
+    /// Run this cell alone, from 0, in this process: what a job of a cluster does
+    #[arg(long, value_name = "INDEX", conflicts_with_all = ["dry_run", "jobs"])]
+    pub cell: Option<usize>,
+    /// Print JSON, and no progress
+    #[arg(long)]
+    pub json: bool,
+}
+
+#[derive(Debug, Subcommand)]
+pub enum SweepCommand {
+    /// How the cells of a sweep stand
+    Status {
+        /// Folder of the sweep
+        #[arg(value_name = "DIR")]
+        dir: PathBuf,
+        /// Print JSON
+        #[arg(long)]
+        json: bool,
+    },
+    /// Keep what finished cells came to as small records, which version control can hold: NAME.jsonl and NAME.json
+    Collect {
+        /// Folder of the sweep
+        #[arg(value_name = "DIR")]
+        dir: PathBuf,
+        /// Folder for the records; those that it has already stay as they are
+        #[arg(long, value_name = "FOLDER")]
+        out: PathBuf,
+    },
 }
 
 #[derive(Args, Debug)]
@@ -257,6 +355,10 @@ pub struct PlayOptions {
     /// Run directory
     #[arg(long, value_name = "DIR")]
     pub run: Option<PathBuf>,
+    /// Which weights of the run: latest; best, where checkpoints.keep_best keeps them; or step-N, those of the checkpoint at N
+    /// environment steps
+    #[arg(long, value_name = "WHICH", value_parser = which)]
+    pub checkpoint: Option<Which>,
     /// Whose tasks a script plays, without a run: name of an experiment or path of a TOML file
     #[arg(long, value_name = "EXPERIMENT")]
     pub experiment: Option<String>,
@@ -572,6 +674,34 @@ fn within<T: TryFrom<u64>>(min: u64, max: u64) -> impl Fn(&str) -> Result<T, Str
     }
 }
 
+/// Which of a run's weights.
+fn which(text: &str) -> Result<Which, String> {
+    match text {
+        "latest" => Ok(Which::Latest),
+        "best" => Ok(Which::Best),
+        _ => text
+            .strip_prefix("step-")
+            .and_then(|step| count(step).ok())
+            .map(Which::Step)
+            .ok_or_else(|| "write latest, best or step-N, such as step-100000".to_owned()),
+    }
+}
+
+/// A name as labels of Kubernetes may be.
+fn label(text: &str) -> Result<String, String> {
+    let is_plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-' || c == '.';
+    let ends = [text.chars().next(), text.chars().last()];
+    if text.len() <= 63
+        && text.chars().all(is_plain)
+        && ends.iter().flatten().all(char::is_ascii_alphanumeric)
+        && !text.is_empty()
+    {
+        Ok(text.to_owned())
+    } else {
+        Err("write a queue's name, of small letters, digits, '-' and '.'".to_owned())
+    }
+}
+
 /// A name or address that a certificate can be for: what a DNS name may be, or an IP address.
 fn host(text: &str) -> Result<String, String> {
     let is_label = |label: &str| {
@@ -640,6 +770,7 @@ pub enum CtlCommand {
     /// Print the address of the run's web page; it carries the run's token
     Web,
     /// Change settings while the run goes on: algorithm.epsilon_finish, evaluation.every_env_steps, evaluation.episodes,
+    /// evaluation.testing_every_env_steps, evaluation.testing_episodes,
     /// checkpoints.every_env_steps, actors.count, actors.heartbeat_timeout_ms, learner.metrics_every_env_steps, and what
     /// the learner logs, such as log=debug
     Set {

@@ -89,8 +89,9 @@ fn over(
             output::print(&if as_json { finished.status_json() } else { finished.status_text() })?;
         }
         CtlCommand::Metrics { from, .. } => {
-            for line in finished::metrics(run_dir, *from)? {
-                if print_line(&line.to_message(), as_json)? == Reader::Gone {
+            let mut metrics = finished::Metrics::open(&run_dir.metrics(), *from)?;
+            while let Some(line) = metrics.next_line()? {
+                if print_line(&line, as_json)? == Reader::Gone {
                     break;
                 }
             }

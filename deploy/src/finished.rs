@@ -1,22 +1,22 @@
 //! A run that is over: what its run directory says of it.
 
 use crate::{failure::Failure, report};
-use rit_config::{RunDir, TEXT_BYTES_MAX, open_regular, read_regular};
-use rit_learner::{metrics::Line, summary::check_format};
+use rit_config::RunDir;
+use rit_learner::messages;
 use rit_policy::place::LATEST;
-use rit_proto::v1::TaskResult;
-use serde_json::{Value, json};
+use rit_proto::v1::{MetricsLine, TaskResult};
+use rit_record::{Ended, Lines, Summary};
+use serde_json::json;
 use std::{
-    fs::{self, OpenOptions},
-    io::{BufRead as _, BufReader},
-    path::PathBuf,
+    fs,
+    path::{Path, PathBuf},
 };
 
 /// What a run came to.
 #[derive(Clone, Debug)]
 pub struct Finished {
     root: PathBuf,
-    summary: Value,
+    summary: Summary,
 }
 
 impl Finished {
@@ -27,10 +27,13 @@ impl Finished {
     pub fn read(run_dir: &RunDir) -> Result<Self, Failure> {
         let path = run_dir.summary();
         let named = |what: String| Failure::runtime_message(format!("{}: {what}", path.display()));
-        let text = read_regular(&path, TEXT_BYTES_MAX).map_err(|error| named(error.to_string()))?;
-        let summary =
-            serde_json::from_slice(&text).map_err(|error| named(format!("it was altered: {error}")))?;
-        check_format(&summary).map_err(|error| named(error.to_string()))?;
+        let summary = Summary::read(run_dir).map_err(|error| {
+            // What is no JSON, or no summary.
+            let altered =
+                error.get_ref().is_some_and(|inner| inner.downcast_ref::<serde_json::Error>().is_some());
+            named(if altered { format!("it was altered: {error}") } else { error.to_string() })
+        })?;
+        let summary = summary.ok_or_else(|| named("there is none yet".to_owned()))?;
         Ok(Self { root: run_dir.root().to_owned(), summary })
     }
 
@@ -45,64 +48,58 @@ impl Finished {
         let finished = Self::read(run_dir)?;
         let newest = fs::read_link(run_dir.checkpoints().join(LATEST)).ok();
         let trained = newest.and_then(|newest| newest.to_str()?.rsplit('-').next()?.parse::<u64>().ok());
-        Ok((trained.unwrap_or(0) <= finished.number("env_steps")).then_some(finished))
+        Ok((trained.unwrap_or(0) <= finished.summary.progress.env_steps).then_some(finished))
     }
 
     /// For people; a run that did not finish says first how it ended.
     pub fn text(&self) -> String {
-        match self.how().as_str() {
-            "" | "finished" => self.figures(),
-            how => format!("{}\n{}", report::printable(how), self.figures()),
+        match self.summary.ended {
+            Ended::Finished => self.figures(),
+            ended => format!("{ended}{}\n{}", self.reason(": "), self.figures()),
         }
     }
 
-    /// How it ended, in a word; nothing where that was altered.
-    pub fn ended(&self) -> &str {
-        self.summary["ended"].as_str().unwrap_or_default()
+    /// How it ended.
+    pub fn ended(&self) -> Ended {
+        self.summary.ended
     }
 
     /// How far training came.
     pub fn env_steps(&self) -> u64 {
-        self.number("env_steps")
+        self.summary.progress.env_steps
     }
 
-    /// How it ended, and why if it failed.
-    fn how(&self) -> String {
-        let word = |key: &str| self.summary[key].as_str().unwrap_or_default();
-        match (word("ended"), word("reason")) {
-            ("until", _) => "finished: the goal of training.until is reached".to_owned(),
-            (ended, "") => ended.to_owned(),
-            (ended, reason) => format!("{ended}: {reason}"),
-        }
+    /// Why it failed, if it did, after this.
+    fn reason(&self, after: &str) -> String {
+        let reason = self.summary.reason.as_deref();
+        reason.map_or_else(String::new, |reason| report::printable(&format!("{after}{reason}")))
     }
 
     fn figures(&self) -> String {
-        let evaluation = self.summary["evaluation"].as_object();
-        let results: Vec<TaskResult> = evaluation.into_iter().flatten().map(task_result).collect();
-        let digest = self.summary["weights_digest"].as_str();
+        let Summary { progress, wall_s, weights_digest, evaluation, .. } = &self.summary;
+        let results: Vec<TaskResult> = evaluation.values().map(messages::task_result).collect();
         format!(
             "{} environment steps, {} episodes, {} updates in {}\n{}{}run directory  {}\n",
-            report::grouped(self.number("env_steps")),
-            report::grouped(self.number("episodes")),
-            report::grouped(self.number("updates")),
-            report::duration(self.summary["wall_s"].as_f64().unwrap_or_default()),
+            report::grouped(progress.env_steps),
+            report::grouped(progress.episodes),
+            report::grouped(progress.updates),
+            report::duration(*wall_s),
             // One that failed was not evaluated at its end.
             if results.is_empty() { String::new() } else { report::table(&results) },
-            digest.map_or_else(String::new, |digest| format!("weights digest {digest}\n")),
+            weights_digest.as_ref().map_or_else(String::new, |digest| format!("weights digest {digest}\n")),
             self.root.display()
         )
     }
 
     /// The summary itself.
     pub fn json(&self) -> String {
-        format!("{:#}\n", self.summary)
+        format!("{:#}\n", json!(self.summary))
     }
 
     /// How the run stands, for people: it is over.
     pub fn status_text(&self) -> String {
-        let said: Vec<_> = ["ended", "reason"].iter().filter_map(|&key| self.summary[key].as_str()).collect();
-        let how = if said.is_empty() { String::new() } else { format!(": {}", said.join(", ")) };
-        format!("the run is over{}\n{}", report::printable(&how), self.figures())
+        let ended = self.summary.ended.word();
+        format!("the run is over: {ended}{}\n{}", self.reason(", "), self.figures())
     }
 
     /// The same for programs, which know a running run by its `state` too.
@@ -113,7 +110,7 @@ impl Finished {
     /// Why nothing can be asked of it any more, and what to do instead.
     pub fn refusal(&self) -> Failure {
         let root = self.root.display();
-        let steps = report::grouped(self.number("env_steps"));
+        let steps = report::grouped(self.summary.progress.env_steps);
         Failure::runtime_message(format!(
             "the run is over, at {steps} environment steps: `rit ctl --run {root} status` shows what it came to, `rit \
              evaluate --run {root}` measures its weights, `rit train --resume {root} --steps N` goes on with it"
@@ -128,31 +125,34 @@ impl Finished {
              --out curves.svg` draws its curves"
         ))
     }
-
-    fn number(&self, key: &str) -> u64 {
-        self.summary[key].as_u64().unwrap_or_default()
-    }
 }
 
 /// What was measured of a run at or behind so many environment steps. A line that is none is left out.
-///
-/// # Errors
-/// When the file cannot be read.
-pub fn metrics(run_dir: &RunDir, from_env_steps: u64) -> Result<impl Iterator<Item = Line>, Failure> {
-    let path = run_dir.metrics();
-    let file = open_regular(&path, OpenOptions::new().read(true))
-        .map_err(|error| Failure::runtime_message(format!("{}: {error}", path.display())))?;
-    let lines = BufReader::new(file).split(b'\n').map_while(Result::ok);
-    let lines = lines.filter_map(|line| serde_json::from_slice::<Line>(&line).ok());
-    Ok(lines.filter(move |line| line.progress().env_steps >= from_env_steps))
+#[derive(Debug)]
+pub struct Metrics {
+    lines: Lines,
+    from_env_steps: u64,
 }
 
-fn task_result((task, result): (&String, &Value)) -> TaskResult {
-    TaskResult {
-        task: task.clone(),
-        episodes: result["episodes"].as_u64().unwrap_or_default(),
-        mean_return: result["mean_return"].as_f64().unwrap_or_default(),
-        win_rate: result["win_rate"].as_f64(),
-        ..TaskResult::default()
+impl Metrics {
+    /// Begins to read.
+    ///
+    /// # Errors
+    /// When the file cannot be read.
+    pub fn open(path: &Path, from_env_steps: u64) -> Result<Self, Failure> {
+        Ok(Self { lines: Lines::open(path).map_err(Failure::runtime)?, from_env_steps })
+    }
+
+    /// The next line; none at the end.
+    ///
+    /// # Errors
+    /// When the file cannot be read.
+    pub fn next_line(&mut self) -> Result<Option<MetricsLine>, Failure> {
+        while let Some(line) = self.lines.next_line().map_err(Failure::runtime)? {
+            if let Some(line) = messages::line(&line).filter(|line| line.env_steps >= self.from_env_steps) {
+                return Ok(Some(line));
+            }
+        }
+        Ok(None)
     }
 }

@@ -3,6 +3,7 @@
 
 mod beginning;
 mod bench;
+mod build;
 mod certificates;
 mod child;
 mod cli;
@@ -28,6 +29,7 @@ mod shutdown;
 mod soak;
 mod starcraft;
 mod supervisor;
+mod sweep;
 mod train;
 mod usage;
 mod warnings;
@@ -67,6 +69,7 @@ async fn run(cli: Cli) -> Result<ExitCode, Failure> {
         Command::Train(options) => train::run(options, logs).await,
         Command::Learner(options) => processes::learner(options, logs).await,
         Command::Actor(options) => processes::actor(options, logs).await,
+        Command::Sweep(options) => sweep::run(options, logs).await,
         Command::Evaluate(options) => evaluate::run(&options),
         Command::Render(options) => render::run(&options),
         Command::Ctl(options) => ctl::run(options).await,

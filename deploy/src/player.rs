@@ -5,8 +5,11 @@ use rit_algo::{Acting, Model};
 use rit_config::{Config, RunDir, resolve, set};
 use rit_env::Script;
 use rit_episode::{Policy, RunSeed};
-use rit_learner::{checkpoint, trainer::evaluation_seed};
-use rit_policy::{place::WEIGHTS, weights_file};
+use rit_learner::{
+    checkpoint::{self, Which},
+    trainer::evaluation_seed,
+};
+use rit_policy::weights_file;
 use std::{path::Path, sync::Arc};
 
 /// The policy of a checkpoint, as it is typed.
@@ -32,25 +35,25 @@ pub struct Trained {
     pub config: Config,
     /// Its model.
     pub model: Arc<Model>,
-    /// All parameters of its newest checkpoint.
+    /// All parameters.
     pub params: Vec<f32>,
 }
 
 impl Trained {
-    /// Reads the run's newest checkpoint.
+    /// Reads these weights of the run.
     ///
     /// # Errors
-    /// When it has none, or it is not as it was written.
-    pub fn load(run: &Path) -> Result<Self, Failure> {
+    /// When it has none, or they are not as they were written.
+    pub fn load(run: &Path, which: Which) -> Result<Self, Failure> {
         let (run_dir, config) = RunDir::open(run)?;
-        let Some(folder) = checkpoint::latest(&run_dir, &config).map_err(Failure::input)? else {
+        let Some(weights) = checkpoint::weights(&run_dir, &config, which).map_err(Failure::input)? else {
             let root = run_dir.root().display();
             return Err(Failure::input_message(format!(
                 "{root} has no checkpoint yet; `rit ctl --run {root} checkpoint` writes one"
             )));
         };
         let model = Arc::new(Model::new(config.model()).map_err(Failure::input)?);
-        let params = weights_file::load(&folder.join(WEIGHTS), model.layout())?;
+        let params = weights_file::load(&weights, model.layout())?;
         Ok(Self { config, model, params })
     }
 }
@@ -88,6 +91,9 @@ impl Player {
     }
 
     fn script(script: Script, options: &PlayOptions) -> Result<Self, Failure> {
+        if options.checkpoint.is_some() {
+            return Err(Failure::input_message("--checkpoint is for weights; a script has none"));
+        }
         let config = match (&options.run, &options.experiment) {
             (Some(run), None) => RunDir::open(run)?.1,
             (None, Some(experiment)) => experiments::load(experiment, &[])?.config,
@@ -118,7 +124,7 @@ impl Player {
                 "give --run DIR, whose checkpoint plays, or a --policy {SCRIPT}NAME that needs none"
             )));
         };
-        let Trained { config, model, params } = Trained::load(run)?;
+        let Trained { config, model, params } = Trained::load(run, options.checkpoint.unwrap_or_default())?;
         let config = with_backend(config, options)?;
         let policy = Box::new(Acting::new(&model, &params[model.acting()]));
         let weights_digest = Some(weights_file::digest(&params));

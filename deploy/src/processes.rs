@@ -1,6 +1,7 @@
 //! `rit learner` and `rit actor`: one process each.
 
 use crate::{
+    build,
     cli::{ActorOptions, LearnerOptions},
     experiments,
     failure::Failure,
@@ -30,7 +31,8 @@ pub async fn learner(options: LearnerOptions, logs: LogOptions) -> Result<ExitCo
     let ended = match rit_worlds::check(&config).map_err(Failure::input) {
         Ok(notice) => {
             notice.iter().for_each(|notice| tracing::warn!("{notice}"));
-            let running = rit_learner::run(run_dir, config, set_log, shutdown).instrument(span);
+            let running =
+                rit_learner::run(run_dir, config, build::this(), set_log, shutdown).instrument(span);
             running.await.map_err(Failure::from)
         }
         Err(failure) => Err(failure),

@@ -17,7 +17,7 @@ use std::{
 pub const PLAIN_EVERY: Duration = Duration::from_secs(10);
 
 /// What may wait for somebody to read it; what comes beyond is in the log alone.
-const WAITING_MAX: usize = 256;
+pub const WAITING_MAX: usize = 256;
 
 /// How long the end of a run waits for what was said to be written.
 const FINISH_TIMEOUT: Duration = Duration::from_secs(2);

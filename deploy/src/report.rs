@@ -18,23 +18,6 @@ pub fn table(results: &[TaskResult]) -> String {
     text
 }
 
-/// The mean over tasks, each counting the same however many episodes it was measured over; `None` of fewer
-/// than two.
-pub fn mean(results: &[TaskResult]) -> Option<TaskResult> {
-    if results.len() < 2 {
-        return None;
-    }
-    let count = results.len() as f64;
-    let wins: Option<f64> = results.iter().map(|result| result.win_rate).sum();
-    Some(TaskResult {
-        task: "mean".to_owned(),
-        episodes: results.iter().map(|result| result.episodes).sum(),
-        mean_return: results.iter().map(|result| result.mean_return).sum::<f64>() / count,
-        win_rate: wins.map(|wins| wins / count),
-        ..TaskResult::default()
-    })
-}
-
 /// Mean return and win rate over tasks, in a few words.
 pub fn in_words(results: &[TaskResult]) -> Option<String> {
     if results.is_empty() {
@@ -202,20 +185,5 @@ mod tests {
         assert_eq!(table(&results).replace("-12.34 ", "-12.35 "), expected);
         assert_eq!(in_words(&results[..1]).unwrap(), "return -12.3, win rate 1.00");
         assert_eq!(in_words(&[]), None);
-    }
-
-    #[test]
-    fn a_mean_counts_every_task_the_same() {
-        let result = |episodes, mean_return, win_rate| TaskResult {
-            task: "game".into(),
-            episodes,
-            mean_return,
-            win_rate,
-            ..TaskResult::default()
-        };
-        let mixed = mean(&[result(10, 1.0, Some(0.5)), result(30, 4.0, Some(1.0))]).unwrap();
-        assert_eq!((mixed.episodes, mixed.mean_return, mixed.win_rate), (40, 2.5, Some(0.75)));
-        assert_eq!(mean(&[result(1, 1.0, None), result(1, 2.0, None)]).unwrap().win_rate, None);
-        assert_eq!(mean(&[result(10, 1.0, None)]), None, "of one task there is nothing to mix");
     }
 }

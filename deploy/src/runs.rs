@@ -1,13 +1,9 @@
 //! `rit runs`: which runs there are, how they stand, and what they have reached.
 
-use crate::{
-    cli::RunsOptions,
-    failure::Failure,
-    finished::{self, Finished},
-    output, report,
-};
+use crate::{cli::RunsOptions, failure::Failure, finished::Finished, output, report};
 use rit_config::RunDir;
-use rit_learner::metrics::Line;
+use rit_env::Split;
+use rit_record::{Evaluation, Line, Lines, Occasion};
 use serde::Serialize;
 use std::{
     fs,
@@ -87,20 +83,11 @@ impl Row {
                 };
             }
         };
-        // A run that was killed before its first line has measured nothing.
-        let lines = finished::metrics(&run_dir, 0).into_iter().flatten();
-        let (mut env_steps, mut evaluations) = (0, Vec::new());
-        for line in lines {
-            env_steps = line.progress().env_steps;
-            if let Line::Evaluation { tasks, .. } = line {
-                evaluations
-                    .push(tasks.into_values().map(|result| (result.mean_return, result.win_rate)).collect());
-            }
-        }
+        let (env_steps, evaluations) = read(&run_dir);
         let finished = if run_dir.is_in_use() { Ok(None) } else { Finished::of(&run_dir) };
         let state = match &finished {
             _ if run_dir.is_in_use() => "running",
-            Ok(Some(finished)) => finished.ended(),
+            Ok(Some(finished)) => finished.ended().word(),
             Ok(None) => "broken off",
             Err(_) => "unreadable",
         };
@@ -148,8 +135,32 @@ impl Row {
     }
 }
 
+/// What an evaluation reached on each task: mean return, and win rate where there is one.
+type Results = Vec<(f64, Option<f64>)>;
+
+/// How far a run has come, and its scheduled evaluations of training tasks. One that was killed before its first line has
+/// measured nothing.
+fn read(run_dir: &RunDir) -> (u64, Vec<Results>) {
+    let (mut env_steps, mut evaluations) = (0, Vec::new());
+    let Ok(mut lines) = Lines::open(&run_dir.metrics()) else { return (env_steps, evaluations) };
+    while let Ok(Some(line)) = lines.next_line() {
+        env_steps = line.progress().map_or(env_steps, |progress| progress.env_steps);
+        if let Line::Evaluation(Evaluation {
+            split: Split::Training,
+            occasion: Occasion::Scheduled,
+            tasks,
+            ..
+        }) = line
+        {
+            let results = tasks.into_values().map(|result| (result.mean_return, result.win_rate));
+            evaluations.push(results.collect());
+        }
+    }
+    (env_steps, evaluations)
+}
+
 /// The mean over tasks of each evaluation, and what it measures: win rates where all tasks know them, else returns.
-fn measured(evaluations: &[Vec<(f64, Option<f64>)>]) -> (Option<&'static str>, Vec<f64>) {
+fn measured(evaluations: &[Results]) -> (Option<&'static str>, Vec<f64>) {
     let evaluations: Vec<_> = evaluations.iter().filter(|results| !results.is_empty()).collect();
     let mean = |values: Vec<f64>| values.iter().sum::<f64>() / values.len() as f64;
     let wins: Option<Vec<f64>> = evaluations

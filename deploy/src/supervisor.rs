@@ -17,7 +17,7 @@ use crate::{
     report::counted,
 };
 use restarts::{DEATHS_MAX, Restarts};
-use rit_learner::summary::Ended;
+use rit_record::Ended;
 use std::{collections::BTreeMap, time::Duration};
 
 pub use messages::{Effect, Event, Exit, Hung, Outcome, Place, Standing};

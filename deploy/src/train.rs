@@ -13,10 +13,8 @@ use crate::{
     supervisor::{Outcome, watch_over},
 };
 use rit_config::{Config, OwnedRunDir, RunDir};
-use rit_learner::{
-    life,
-    summary::{Ended, Summary},
-};
+use rit_learner::{life, summary};
+use rit_record::{Ended, Summary};
 use std::{num::NonZero, path::Path, process::ExitCode};
 use tracing::Instrument as _;
 
@@ -37,7 +35,7 @@ pub async fn run(options: TrainOptions, logs: LogOptions) -> Result<ExitCode, Fa
             return Err(failure);
         }
     };
-    supervise(owned, &config, &said, &logs, options.json).instrument(span).await
+    supervise(owned, &config, &said, &logs, &options).instrument(span).await
 }
 
 async fn supervise(
@@ -45,7 +43,7 @@ async fn supervise(
     config: &Config,
     said: &[String],
     logs: &LogOptions,
-    json: bool,
+    &TrainOptions { json, supervised, .. }: &TrainOptions,
 ) -> Result<ExitCode, Failure> {
     let run_dir = owned.run_dir();
     let mut progress = Progress::new(config.training.t_max, json);
@@ -54,7 +52,8 @@ async fn supervise(
         progress.say(&words);
     }
 
-    let (outcome, begun) = watch_over(&owned, logs, &mut progress, config.actors.count as u32).await;
+    let (outcome, begun) =
+        watch_over(&owned, logs, &mut progress, config.actors.count as u32, supervised).await;
     progress.finish();
     // Whatever became of the children, nothing of the run stays in shared memory.
     life::remove_dead(run_dir);
@@ -74,7 +73,7 @@ async fn supervise(
             Err(Failure::input_message(message))
         }
         Outcome::Failed { input: false, message } => {
-            if begun && let Err(error) = Summary::write_failed(run_dir, &message) {
+            if begun && let Err(error) = summary::write_failed(run_dir, &message) {
                 tracing::warn!(%error, "summary.json was not written");
             }
             Err(Failure::runtime_message(message))

@@ -365,7 +365,7 @@ async fn an_actor_that_comes_back_takes_its_place_over() {
 fn all_lost(lease: &v1::Lease) -> Said {
     let (reason, detail) = ("environment_died".to_owned(), "the game has ended".to_owned());
     let loss = v1::Loss { reason, episodes: lease.episodes.clone(), detail };
-    Said::Done(v1::Done { lease: lease.lease, losses: vec![loss] })
+    Said::Done(v1::Done { lease: lease.lease, losses: vec![loss], cpu_ms: 0 })
 }
 
 #[tokio::test]

@@ -37,7 +37,9 @@ fn a_follower_gets_every_line_until_the_run_is_over() {
     let followed: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let mut written = metrics_lines(&run_dir);
     written.retain(|line| line["env_steps"].as_u64() >= Some(100));
-    assert_eq!((followed.len(), written.len()), (451, 451));
+    // One an episode, and the evaluation at the end.
+    assert_eq!((followed.len(), written.len()), (452, 452));
+    assert_eq!((&written[451]["kind"], &written[451]["occasion"]), (&"evaluation".into(), &"final".into()));
     for (line, written) in followed.iter().zip(&written) {
         for key in ["env_steps", "episodes", "updates", "wall_s"] {
             assert_eq!(line[key], written[key], "{key}");
@@ -52,7 +54,7 @@ fn a_follower_gets_every_line_until_the_run_is_over() {
             }
         }
     }
-    let tasks = &followed.last().unwrap()["tasks"];
+    let tasks = &followed[450]["tasks"];
     let totals = tasks.as_array().unwrap().iter().map(|task| task["episodes_total"].as_u64().unwrap());
     assert_eq!(totals.sum::<u64>(), 500);
     assert!(tasks.as_array().unwrap().iter().all(|task| task["policy_lag"] == 1), "{tasks}");

@@ -37,12 +37,12 @@ fn several_tasks_are_followed_by_their_mean() {
     let arguments = ["--experiment", "matrix-game", "--episodes", "10"];
     let text = evaluate("script:still", &arguments);
     // Still is action a¹ twice: it wins game 4 and no other.
-    let expected = "task    episodes  mean return  win rate\n\
-                    game-1        10       -24.00     0.000\n\
-                    game-2        10       -18.00     0.000\n\
-                    game-3        10       -12.00     0.000\n\
-                    game-4        10       106.00     1.000\n\
-                    mean          40        13.00     0.250\n";
+    let expected = "task    episodes  mean return       std        95 % interval  win rate\n\
+                    game-1        10       -24.00      0.00     [-24.00, -24.00]     0.000\n\
+                    game-2        10       -18.00      0.00     [-18.00, -18.00]     0.000\n\
+                    game-3        10       -12.00      0.00     [-12.00, -12.00]     0.000\n\
+                    game-4        10       106.00      0.00     [106.00, 106.00]     1.000\n\
+                    mean          40        13.00         -       [13.00, 13.00]     0.250\n";
     assert_eq!(text, expected);
     let one = evaluate("script:still", &[&arguments[..], &["--tasks", "game-4"]].concat());
     assert!(one.lines().count() == 2 && !one.contains("mean  "), "{one}");

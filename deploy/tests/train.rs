@@ -46,7 +46,8 @@ fn two_actors_and_a_learner_train_and_leave_a_whole_run_directory() {
     assert!(run_dir.join("checkpoints/latest/weights.safetensors").is_file());
     let lines = metrics_lines(&run_dir);
     let of_kind = |kind: &str| lines.iter().filter(|line| line["kind"] == kind).count();
-    assert_eq!((of_kind("training"), of_kind("evaluation")), (6, 1));
+    // At the beginning and at the end.
+    assert_eq!((of_kind("training"), of_kind("evaluation")), (6, 2));
     assert_eq!(std::fs::metadata(&run_dir).unwrap().permissions().mode() & 0o777, 0o700);
 
     assert_eq!(shared_memory_of(&run_dir), [] as [std::path::PathBuf; 0]);

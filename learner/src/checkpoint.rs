@@ -5,6 +5,7 @@
 //! | file | what it holds |
 //! |---|---|
 //! | `weights.safetensors` | the weights, under the specification's names |
+//! | `best.safetensors` | those of the best evaluation so far, where `checkpoints.keep_best` asks for them |
 //! | `state.safetensors` | the learner's state under its names (target network, optimiser moments, …), and the acting weights that open batches are rolled with |
 //! | `checkpoint.json` | progress, the terms of open batches, positions in other files |
 //! | `SHA256SUMS` | of the files above; `sha256sum --check SHA256SUMS` |
@@ -20,8 +21,8 @@ mod newest;
 mod origin;
 mod written;
 
-pub use manifest::{Manifest, Progress, SnapshotMark};
-pub use newest::{Loaded, latest, load_newest};
+pub use manifest::{Manifest, SnapshotMark};
+pub use newest::{Loaded, Which, load_newest, weights};
 pub use origin::{FORMAT_VERSION, Origin, OtherOrigin};
 
 use crate::{
@@ -48,6 +49,8 @@ use std::{
     path::{Path, PathBuf},
 };
 
+/// The best weights' file inside a checkpoint.
+const BEST: &str = "best.safetensors";
 const STATE: &str = "state.safetensors";
 const MANIFEST: &str = "checkpoint.json";
 const SUMS: &str = "SHA256SUMS";
@@ -59,6 +62,8 @@ const FILE_BYTES_MAX: u64 = 1 << 36;
 pub struct TrainingState {
     /// All parameters.
     pub params: Vec<f32>,
+    /// Those of the best policy, which the manifest tells of.
+    pub best: Option<Vec<f32>>,
     /// The rest of the learner: see [`Learner::state`].
     pub learner: Vec<NamedState<'static>>,
     /// The acting weights that the terms name.
@@ -141,6 +146,25 @@ pub enum CheckpointError {
         /// The newest one's folder.
         newest: String,
     },
+    /// No best policy is kept.
+    #[error(
+        "{folder} keeps no best policy: checkpoints.keep_best was not set when it was written; --checkpoint latest plays \
+         the newest"
+    )]
+    NoBest {
+        /// The newest checkpoint.
+        folder: PathBuf,
+    },
+    /// There is no such checkpoint.
+    #[error("{folder} holds no checkpoint at {env_steps} steps; there are: {}", there.join(", "))]
+    NoStep {
+        /// The folder of all checkpoints.
+        folder: PathBuf,
+        /// What was asked for.
+        env_steps: u64,
+        /// Those there are.
+        there: Vec<String>,
+    },
     /// Fewer steps are wanted than there are.
     #[error(
         "training.t_max = {t_max}, and {env_steps} steps are done already; set it higher (--steps), or leave it as it was"
@@ -210,11 +234,14 @@ fn write_folder(
     };
     let manifest = serde_json::to_vec_pretty(&state.manifest);
     let manifest = manifest.map_err(|error| io(&folder.join(MANIFEST))(error.into()))?;
-    let files = [
+    let mut files = vec![
         (WEIGHTS, weights_file::encode(model, names, &state.params).map_err(format(WEIGHTS))?),
         (STATE, encode_state(state).map_err(format(STATE))?),
         (MANIFEST, manifest),
     ];
+    if let Some(best) = &state.best {
+        files.push((BEST, weights_file::encode(model, names, best).map_err(format(BEST))?));
+    }
     let mut sums = String::new();
     for (name, bytes) in &files {
         sums += &format!("{}  {name}\n", sha256(bytes));
@@ -285,11 +312,16 @@ fn load(
         |name: &str, what: String| CheckpointError::Inconsistent { path: folder.join(name), what };
     let manifest = load_manifest(folder)?;
     manifest.check(tasks, algorithm).map_err(|what| inconsistent(MANIFEST, what))?;
-    read_checked(folder, WEIGHTS)?;
-    let params = weights_file::load(&folder.join(WEIGHTS), learner.model().layout())?;
-    if weights_file::digest(&params) != manifest.weights_digest {
-        return Err(inconsistent(WEIGHTS, format!("its weights are not those that {MANIFEST} names")));
-    }
+    let weights = |name: &str, digest: &String| {
+        read_checked(folder, name)?;
+        let params = weights_file::load(&folder.join(name), learner.model().layout())?;
+        if weights_file::digest(&params) != *digest {
+            return Err(inconsistent(name, format!("its weights are not those that {MANIFEST} names")));
+        }
+        Ok(params)
+    };
+    let params = weights(WEIGHTS, &manifest.weights_digest)?;
+    let best = manifest.best.as_ref().map(|best| weights(BEST, &best.weights_digest)).transpose()?;
     let bytes = read_checked(folder, STATE)?;
     let format = |error| CheckpointError::Format { path: folder.join(STATE), error };
     let tensors = SafeTensors::deserialize(&bytes).map_err(format)?;
@@ -316,7 +348,7 @@ fn load(
         let params = tensor(&snapshot_name(*version), Dtype::F32, learner.model().acting().len())?;
         snapshots.push(Snapshot { version: *version, env_steps: *env_steps, params: params.into() });
     }
-    Ok(TrainingState { params, learner: state, snapshots, manifest })
+    Ok(TrainingState { params, best, learner: state, snapshots, manifest })
 }
 
 /// Little-endian numbers.

@@ -2,11 +2,12 @@
 
 use crate::{
     coordinator::Control,
-    metrics::{Follower, Line},
+    messages,
+    metrics::Follower,
     run_handle::{AskError, RunHandle},
-    summary::Ended,
 };
 use rit_proto::v1::{self, control_server};
+use rit_record::{Ended, Line};
 use std::{pin::Pin, time::Duration};
 use tokio::{sync::mpsc, time::MissedTickBehavior};
 use tokio_stream::{Stream, wrappers::ReceiverStream};
@@ -78,9 +79,11 @@ impl MetricsReader {
             if lines.is_empty() {
                 return Some(());
             }
-            for line in lines.iter().filter(|line| line.progress().env_steps >= self.from_env_steps) {
-                let line = v1::metrics_update::Update::Line(Line::to_message(line));
-                self.to.send(Ok(update(line))).await.ok()?;
+            let is_wanted = |line: &&Line| {
+                line.progress().is_none_or(|progress| progress.env_steps >= self.from_env_steps)
+            };
+            for line in lines.iter().filter(is_wanted).filter_map(messages::line) {
+                self.to.send(Ok(update(v1::metrics_update::Update::Line(line)))).await.ok()?;
             }
         }
     }

@@ -14,11 +14,9 @@ mod standstill;
 mod status;
 
 use crate::{
-    evaluation::in_words,
     gauges::{Checkpoints, Happenings, RateWindow, Stopwatch},
     ledger::{ActorId, Counts, Lease, Ledger, Reason},
     receive::Fence,
-    summary::Ended,
     trainer::{Beginning, News, Standing},
     writer::CheckpointEnded,
 };
@@ -26,6 +24,7 @@ use rit_algo::learner::Measure;
 use rit_config::Config;
 use rit_env::FailureKind;
 use rit_episode::Episode;
+use rit_record::{Ended, in_words};
 use std::{
     collections::{BTreeMap, BTreeSet},
     time::Duration,

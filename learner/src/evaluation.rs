@@ -6,66 +6,19 @@ use rit_env::{
     rollout::{Job, LostEpisode, Rollout, all_rolled},
 };
 use rit_episode::{Choice, Episode, Policy, RunSeed};
-use rit_proto::v1;
-use serde::{Deserialize, Serialize};
-use std::{collections::BTreeMap, ops::Range, sync::Arc};
+use rit_record::{EachEpisode, TaskResult};
+use std::{
+    ops::Range,
+    panic::resume_unwind,
+    sync::{
+        Arc, Mutex, PoisonError,
+        atomic::{AtomicBool, Ordering},
+    },
+    thread,
+};
 
-/// Episodes rolled side by side.
-const SIDE_BY_SIDE: usize = 32;
-
-/// What a policy reached on one task.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct TaskResult {
-    /// The task's name.
-    #[serde(skip)]
-    pub task: String,
-    /// Episodes it was measured over.
-    pub episodes: u64,
-    /// Mean of undiscounted returns.
-    pub mean_return: f64,
-    /// Share of episodes won, where the task knows winning.
-    pub win_rate: Option<f64>,
-    /// Of exploring episodes: how the task goes on the whole.
-    #[serde(flatten)]
-    pub exploring: Option<Exploring>,
-}
-
-/// How the exploring episodes of a task came in.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Exploring {
-    /// All that were collected.
-    pub episodes_total: u64,
-    /// Weights version of the learner minus that of the newest one, when it entered replay.
-    pub policy_lag: u64,
-}
-
-impl TaskResult {
-    /// As a message.
-    pub fn to_message(&self) -> v1::TaskResult {
-        v1::TaskResult {
-            task: self.task.clone(),
-            episodes: self.episodes,
-            mean_return: self.mean_return,
-            win_rate: self.win_rate,
-            episodes_total: self.exploring.map(|exploring| exploring.episodes_total),
-            policy_lag: self.exploring.map(|exploring| exploring.policy_lag),
-        }
-    }
-}
-
-/// Results by task, as they stand in files.
-pub fn by_task(results: &[TaskResult]) -> BTreeMap<String, TaskResult> {
-    results.iter().map(|result| (result.task.clone(), result.clone())).collect()
-}
-
-/// Results in a line of words.
-pub fn in_words(results: &[TaskResult]) -> String {
-    let words = results.iter().map(|result| match result.win_rate {
-        Some(win_rate) => format!("{} wins {win_rate:.2}", result.task),
-        None => format!("{} {:.1}", result.task, result.mean_return),
-    });
-    words.collect::<Vec<_>>().join(", ")
-}
+/// Episodes rolled side by side, at most and at least: fewer cost more, more leave threads without any.
+const SIDE_BY_SIDE: Range<usize> = 8..32;
 
 /// Why there is nothing to evaluate.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -150,59 +103,65 @@ impl Evaluator {
         Ok(tasks)
     }
 
-    /// Rolls greedy episodes of each task, so many of each as are asked for or as the run has of its own. Those that are
-    /// lost are rolled again.
-    ///
-    /// # Errors
-    /// When environments fail again and again.
-    pub fn evaluate_own(
-        &self,
-        policy: &mut dyn Policy,
-        tasks: &[Task],
-        asked: Option<usize>,
-        seed: RunSeed,
-    ) -> Result<Vec<TaskResult>, LostEpisode> {
-        // Nobody gives it up.
-        self.evaluate_unless(policy, tasks, asked, seed, &|| false).map(Option::unwrap_or_default)
-    }
-
-    /// Rolls so many greedy episodes of each task. The same seed rolls the same episodes.
+    /// Rolls greedy episodes of each task, so many of each as are asked for or as the run has of its own: on as many
+    /// threads as there are policies, all of which must be the same. The same seed rolls the same episodes, on however
+    /// many. Those that are lost are rolled again.
     ///
     /// # Errors
     /// When environments fail again and again.
     pub fn evaluate(
         &self,
-        policy: &mut dyn Policy,
+        policies: &mut [&mut dyn Policy],
         tasks: &[Task],
-        episodes: usize,
+        asked: Option<usize>,
         seed: RunSeed,
     ) -> Result<Vec<TaskResult>, LostEpisode> {
-        self.evaluate_own(policy, tasks, Some(episodes), seed)
+        // Nobody gives it up.
+        self.evaluate_unless(policies, tasks, asked, seed, &|| false).map(Option::unwrap_or_default)
     }
 
-    /// [`Self::evaluate_own`], given up within a few episodes once nobody wants it any more: then `None`.
+    /// [`Self::evaluate`], given up within a few episodes once nobody wants it any more: then `None`.
     ///
     /// # Errors
     /// When environments fail again and again.
     pub fn evaluate_unless(
         &self,
-        policy: &mut dyn Policy,
+        policies: &mut [&mut dyn Policy],
         tasks: &[Task],
         asked: Option<usize>,
         seed: RunSeed,
-        given_up: &dyn Fn() -> bool,
+        given_up: &(dyn Fn() -> bool + Sync),
     ) -> Result<Option<Vec<TaskResult>>, LostEpisode> {
-        let mut results = Vec::with_capacity(tasks.len());
-        for &task in tasks {
-            let episodes = asked.unwrap_or_else(|| self.own_episodes(task));
-            let Some(result) = self.evaluate_task(policy, task, episodes, seed, given_up)? else {
-                return Ok(None);
-            };
-            results.push(result);
-        }
+        let counts = tasks.iter().map(|&task| asked.unwrap_or_else(|| self.own_episodes(task)));
+        let wanted: Vec<(Task, usize)> = tasks.iter().copied().zip(counts).collect();
+        let threads = policies.len().min(self.factory.worlds_max()).max(1);
+        let policies = &mut policies[..threads];
+        let parts = parts(&wanted, threads, self.factory.worlds_max());
+        let (work, over) = (Mutex::new(parts.into_iter().enumerate()), AtomicBool::new(false));
+        let roll = |policy: &mut dyn Policy| self.roll_parts(policy, &work, seed, &over, given_up);
+        let rolled = match policies {
+            [policy] => vec![roll(*policy)],
+            policies => thread::scope(|scope| {
+                let threads: Vec<_> =
+                    policies.iter_mut().map(|policy| scope.spawn(|| roll(&mut **policy))).collect();
+                threads
+                    .into_iter()
+                    .map(|thread| thread.join().unwrap_or_else(|panic| resume_unwind(panic)))
+                    .collect()
+            }),
+        };
         // The next evaluation may be long in coming.
         self.factory.rest();
-        Ok(Some(results))
+        let mut rolled: Vec<Rolled> = rolled.into_iter().collect::<Result<Vec<_>, _>>()?.concat();
+        if over.into_inner() {
+            return Ok(None);
+        }
+        rolled.sort_by_key(|part| part.number);
+        let result = |(at, &(task, count)): (usize, &(Task, usize))| {
+            let episodes = rolled.iter().filter(|part| part.task == at).flat_map(|part| &part.episodes);
+            result(task, count, self.factory.spec(task).has_wins, episodes)
+        };
+        Ok(Some(wanted.iter().enumerate().map(result).collect()))
     }
 
     /// Rolls those episodes of these numbers that [`Self::evaluate`] rolls of a task with this seed, and shows
@@ -226,35 +185,93 @@ impl Evaluator {
         Rollout::new(vec![task], Arc::clone(&self.factory), seed, self.random_permutation)
     }
 
-    fn evaluate_task(
+    /// Rolls parts of the work until there is none, or nobody wants it any more: then it is `over` for all.
+    fn roll_parts(
         &self,
         policy: &mut dyn Policy,
-        task: Task,
-        episodes: usize,
+        work: &Mutex<impl Iterator<Item = (usize, Part)>>,
         seed: RunSeed,
-        given_up: &dyn Fn() -> bool,
-    ) -> Result<Option<TaskResult>, LostEpisode> {
-        let mut rollout = self.rollout(task, seed);
-        let (mut total, mut won) = (0.0, 0);
-        let side_by_side = SIDE_BY_SIDE.min(self.factory.worlds_max()).max(1);
-        for begin in (0..episodes as u64).step_by(side_by_side) {
+        over: &AtomicBool,
+        given_up: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Vec<Rolled>, LostEpisode> {
+        let (mut rolled, mut rollout) = (Vec::new(), None::<(Task, Rollout)>);
+        let next = || work.lock().unwrap_or_else(PoisonError::into_inner).next();
+        while !over.load(Ordering::Relaxed) {
+            let Some((number, Part { task, at, numbers })) = next() else { break };
             if given_up() {
-                return Ok(None);
+                over.store(true, Ordering::Relaxed);
+                break;
             }
-            let numbers = begin..(begin + side_by_side as u64).min(episodes as u64);
-            for episode in rollout.roll_all(policy, &jobs(numbers))? {
-                total += episode.total_reward();
-                won += usize::from(episode.won);
-            }
+            let rollout = match &mut rollout {
+                Some((of, rollout)) if *of == task => rollout,
+                other => &mut other.insert((task, self.rollout(task, seed))).1,
+            };
+            let episodes = rollout
+                .roll_all(policy, &jobs(numbers))
+                .inspect_err(|_| over.store(true, Ordering::Relaxed))?;
+            let facts = |episode: Episode| (episode.total_reward(), episode.steps() as u32, episode.won);
+            rolled.push(Rolled { number, task: at, episodes: episodes.into_iter().map(facts).collect() });
         }
-        let share = |sum: f64| sum / episodes as f64;
-        Ok(Some(TaskResult {
-            task: task.to_string(),
-            episodes: episodes as u64,
-            mean_return: share(total),
-            win_rate: self.factory.spec(task).has_wins.then(|| share(won as f64)),
-            exploring: None,
-        }))
+        Ok(rolled)
+    }
+}
+
+/// Episodes of one task that one thread rolls side by side.
+#[derive(Debug)]
+struct Part {
+    task: Task,
+    /// The task's place among those evaluated.
+    at: usize,
+    numbers: Range<u64>,
+}
+
+/// The episodes of a part: return, steps, whether it was won.
+#[derive(Clone, Debug)]
+struct Rolled {
+    /// The part's place in the work.
+    number: usize,
+    task: usize,
+    episodes: Vec<(f64, u32, bool)>,
+}
+
+/// All that is to be rolled, in parts small enough that every thread has several, and that all threads together play in no
+/// more worlds than there may be.
+fn parts(wanted: &[(Task, usize)], threads: usize, worlds_max: usize) -> Vec<Part> {
+    let count = |size: usize| wanted.iter().map(|(_, episodes)| episodes.div_ceil(size)).sum::<usize>();
+    let mut size = (worlds_max / threads).clamp(1, SIDE_BY_SIDE.end);
+    while threads > 1 && size > SIDE_BY_SIDE.start && count(size) < 2 * threads {
+        size /= 2;
+    }
+    let of_task = |(at, &(task, episodes)): (usize, &(Task, usize))| {
+        let begins = (0..episodes).step_by(size);
+        begins.map(move |begin| Part { task, at, numbers: begin as u64..(begin + size).min(episodes) as u64 })
+    };
+    wanted.iter().enumerate().flat_map(of_task).collect()
+}
+
+/// What the episodes of a task, in the order of their numbers, come to.
+fn result<'a>(
+    task: Task,
+    count: usize,
+    has_wins: bool,
+    episodes: impl Iterator<Item = &'a (f64, u32, bool)>,
+) -> TaskResult {
+    let (mut total, mut won, mut each) = (0.0, 0, EachEpisode::default());
+    for &(episode_return, steps, episode_won) in episodes {
+        total += episode_return;
+        won += usize::from(episode_won);
+        each.returns.push(episode_return as f32);
+        each.lengths.push(steps);
+        each.wins.extend(has_wins.then_some(episode_won));
+    }
+    let share = |sum: f64| sum / count as f64;
+    TaskResult {
+        task: task.to_string(),
+        episodes: count as u64,
+        mean_return: share(total),
+        win_rate: has_wins.then(|| share(won as f64)),
+        each: Some(each),
+        exploring: None,
     }
 }
 
@@ -269,8 +286,10 @@ mod tests {
     use super::*;
     use rit_env::Script;
     use rit_episode::Turn;
+    use std::sync::atomic::AtomicUsize;
 
     /// Plays what wins game 4 of the matrix games, in any order.
+    #[derive(Clone)]
     struct FirstAction;
 
     impl Policy for FirstAction {
@@ -286,7 +305,7 @@ mod tests {
         let config = rit_config::resolve("environment.task_set = \"matrix-game\"", "test", &[]).unwrap();
         let evaluator = Evaluator::new(&config);
         let tasks = evaluator.tasks(&["game-4".into(), "game-2".into()]).unwrap();
-        let results = evaluator.evaluate(&mut FirstAction, &tasks, 70, RunSeed(1)).unwrap();
+        let results = evaluator.evaluate(&mut [&mut FirstAction], &tasks, Some(70), RunSeed(1)).unwrap();
         let facts: Vec<_> =
             results.iter().map(|r| (r.task.as_str(), r.episodes, r.mean_return, r.win_rate)).collect();
         assert_eq!(facts, [("game-4", 70, 106.0, Some(1.0)), ("game-2", 70, -18.0, Some(0.0))]);
@@ -306,7 +325,7 @@ mod tests {
         let evaluator = Evaluator::new(&rit_config::resolve(text, "test", &settings).unwrap());
         let tasks = evaluator.tasks(&["training".into(), "testing".into()]).unwrap();
         let counts = |asked| {
-            let results = evaluator.evaluate_own(&mut Script::Still, &tasks, asked, RunSeed(1)).unwrap();
+            let results = evaluator.evaluate(&mut [&mut Script::Still], &tasks, asked, RunSeed(1)).unwrap();
             results.iter().map(|result| result.episodes).collect::<Vec<_>>()
         };
         let (training, testing) = (
@@ -333,11 +352,56 @@ mod tests {
         let config = rit_config::resolve("environment.task_set = \"matrix-game\"", "test", &[]).unwrap();
         let evaluator = Evaluator::new(&config);
         let tasks = evaluator.tasks(&[]).unwrap();
-        let looks = std::cell::Cell::new(0);
-        let given_up = || looks.replace(looks.get() + 1) == 3;
-        let results =
-            evaluator.evaluate_unless(&mut FirstAction, &tasks, Some(1_000_000_000), RunSeed(1), &given_up);
-        assert!(results.unwrap().is_none() && looks.get() == 4, "{}", looks.get());
+        for threads in [1, 3] {
+            let looks = AtomicUsize::new(0);
+            let given_up = || looks.fetch_add(1, Ordering::Relaxed) >= 3;
+            let mut policies = vec![FirstAction; threads];
+            let mut policies: Vec<_> = policies.iter_mut().map(|policy| policy as &mut dyn Policy).collect();
+            let results =
+                evaluator.evaluate_unless(&mut policies, &tasks, Some(1_000_000), RunSeed(1), &given_up);
+            assert!(results.unwrap().is_none());
+            assert!((4..4 + threads).contains(&looks.into_inner()), "each thread looks once more at most");
+        }
+    }
+
+    #[test]
+    fn threads_share_the_work_and_change_nothing() {
+        let text = "environment.task_set = \"cooperative-navigation\"";
+        let config = rit_config::resolve(text, "test", &[]).unwrap();
+        let evaluator = Evaluator::new(&config);
+        let tasks = evaluator.tasks(&["training".into(), "testing".into()]).unwrap();
+        let evaluate = |threads: usize| {
+            let mut policies = vec![Script::Still; threads];
+            let mut policies: Vec<_> = policies.iter_mut().map(|policy| policy as &mut dyn Policy).collect();
+            evaluator.evaluate(&mut policies, &tasks, Some(37), RunSeed(1)).unwrap()
+        };
+        let one = evaluate(1);
+        let each = one[0].each.as_ref().unwrap();
+        assert_eq!((each.returns.len(), each.lengths.clone(), each.wins.len()), (37, vec![25; 37], 0));
+        assert!(one.iter().any(|result| result.std_return() > Some(0.0)), "{one:?}");
+        for threads in [2, 3, 16] {
+            assert_eq!(evaluate(threads), one, "{threads}");
+        }
+    }
+
+    #[test]
+    fn every_thread_gets_several_parts_where_there_are_enough_episodes() {
+        let task = TaskSet::MatrixGame.tasks(Split::Training)[0];
+        let sizes_within = |episodes: &[usize], threads, worlds_max| {
+            let wanted: Vec<_> = episodes.iter().map(|&episodes| (task, episodes)).collect();
+            parts(&wanted, threads, worlds_max)
+                .iter()
+                .map(|part| part.numbers.end - part.numbers.start)
+                .collect::<Vec<_>>()
+        };
+        let sizes = |episodes: &[usize], threads| sizes_within(episodes, threads, usize::MAX);
+        assert_eq!(sizes(&[70], 1), [32, 32, 6]);
+        assert_eq!(sizes(&[32, 32, 32], 2), [16; 6]);
+        assert_eq!(sizes(&[160, 160], 2), [32; 10]);
+        assert_eq!(sizes(&[10], 8), [8, 2]);
+        assert_eq!(sizes(&[], 8), [0; 0]);
+        assert_eq!(sizes_within(&[10], 2, 5), [2; 5], "games that are few");
+        assert_eq!(sizes_within(&[2], 1, 1), [1, 1]);
     }
 
     #[test]
@@ -349,7 +413,7 @@ mod tests {
         let watched = evaluator
             .watch(&mut Script::Chase, task, 0..4, RunSeed(1), |episode, _| states[episode] += 1)
             .unwrap();
-        let measured = evaluator.evaluate(&mut Script::Chase, &[task], 4, RunSeed(1)).unwrap();
+        let measured = evaluator.evaluate(&mut [&mut Script::Chase], &[task], Some(4), RunSeed(1)).unwrap();
         let mean = watched.iter().map(Episode::total_reward).sum::<f64>() / 4.0;
         assert_eq!((mean, states), (measured[0].mean_return, [26; 4]));
         let last = evaluator.watch(&mut Script::Chase, task, 3..4, RunSeed(1), |_, _| {}).unwrap();

@@ -1,7 +1,7 @@
 //! What the coordinator measures beside what it decides: for people, never for training. Moments count from the
 //! learner's beginning.
 
-use crate::checkpoint::Progress;
+use rit_record::Progress;
 use std::{collections::VecDeque, time::Duration};
 
 /// Rates are taken over so long.

@@ -3,17 +3,13 @@
 
 use crate::{
     append_file::AppendFile,
-    checkpoint::Progress,
-    evaluation::{Exploring, TaskResult},
-    measured::Measured,
-    metrics_repair::{End, Header, MetricsError, is_header, repair},
+    metrics_repair::{End, MetricsError, repair},
 };
 use rit_config::open_regular;
 use rit_episode::Episode;
-use rit_proto::v1;
-use serde::{Deserialize, Serialize};
+use rit_record::{Exploring, Header, Line, TaskResult, is_header};
 use std::{
-    collections::{BTreeMap, VecDeque},
+    collections::VecDeque,
     fs::OpenOptions,
     io::{self, Read as _, Seek as _, SeekFrom},
     path::{Path, PathBuf},
@@ -90,74 +86,11 @@ impl Recent {
                     episodes: recent.len() as u64,
                     mean_return: recent.iter().map(|(total, _)| total).sum::<f64>() / count,
                     win_rate: self.has_wins.then_some(won / count),
+                    each: None,
                     exploring: Some(*exploring),
                 }
             })
             .collect()
-    }
-}
-
-/// One line of `metrics.jsonl`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "kind", rename_all = "snake_case")]
-pub enum Line {
-    /// How training goes.
-    Training {
-        /// How far it has come.
-        #[serde(flatten)]
-        progress: Progress,
-        /// Seconds that learners have run.
-        wall_s: f64,
-        /// ε of the episodes handed out now.
-        epsilon: f64,
-        /// Exploring episodes of late.
-        tasks: BTreeMap<String, TaskResult>,
-        /// What the last update reported. The last field: it takes the keys that no other has.
-        #[serde(flatten)]
-        measured: Measured,
-    },
-    /// A greedy evaluation.
-    Evaluation {
-        /// How far training had come.
-        #[serde(flatten)]
-        progress: Progress,
-        /// Seconds that learners have run.
-        wall_s: f64,
-        /// Its results.
-        tasks: BTreeMap<String, TaskResult>,
-    },
-}
-
-impl Line {
-    /// How far training had come.
-    pub fn progress(&self) -> Progress {
-        match self {
-            Self::Training { progress, .. } | Self::Evaluation { progress, .. } => *progress,
-        }
-    }
-
-    /// As a message.
-    pub fn to_message(&self) -> v1::MetricsLine {
-        let (Self::Training { progress, wall_s, tasks, .. } | Self::Evaluation { progress, wall_s, tasks }) =
-            self;
-        let named = |(task, result): (&String, &TaskResult)| v1::TaskResult {
-            task: task.clone(),
-            ..result.to_message()
-        };
-        let training = match self {
-            Self::Training { epsilon, measured, .. } => {
-                Some(v1::Training { epsilon: *epsilon, measures: measured.to_messages(&[]) })
-            }
-            Self::Evaluation { .. } => None,
-        };
-        v1::MetricsLine {
-            env_steps: progress.env_steps,
-            episodes: progress.episodes,
-            updates: progress.updates,
-            wall_s: *wall_s,
-            tasks: tasks.iter().map(named).collect(),
-            training,
-        }
     }
 }
 
@@ -265,7 +198,7 @@ impl Follower {
         self.at += whole as u64;
         let lines =
             text[..whole].split(|&byte| byte == b'\n').filter(|line| !line.is_empty() && !is_header(line));
-        lines.map(|line| serde_json::from_slice(line).map_err(io::Error::from)).collect()
+        lines.map(|line| Line::parse(line).map_err(io::Error::from)).collect()
     }
 
     /// Where it reads on, in bytes.
@@ -287,23 +220,12 @@ impl Follower {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::messages::line_of_test as line;
     use std::fs;
 
-    fn line(env_steps: u64) -> Line {
-        let exploring = Some(Exploring { episodes_total: 7, policy_lag: 1 });
-        let result =
-            TaskResult { task: String::new(), episodes: 5, mean_return: 0.1, win_rate: None, exploring };
-        Line::Training {
-            progress: Progress { env_steps, episodes: 3, updates: 2 },
-            wall_s: 0.5,
-            epsilon: 0.1 + 0.2,
-            measured: Measured(vec![("td_loss".into(), 1e-9), ("target_mean".into(), -3.0)]),
-            tasks: BTreeMap::from([("game-1".to_owned(), result)]),
-        }
-    }
-
     fn open(path: &Path, end: Option<End>, before_s: f64) -> MetricsFile {
-        let (file, warning) = MetricsFile::open(path, &Header::of_test(), end, before_s).unwrap();
+        let header = Header::of("ab".into(), None);
+        let (file, warning) = MetricsFile::open(path, &header, end, before_s).unwrap();
         assert_eq!(warning, None);
         file
     }
@@ -345,7 +267,7 @@ mod tests {
                 if lines.is_empty() {
                     return read.len();
                 }
-                read.extend(lines.iter().map(|line| line.progress().env_steps));
+                read.extend(lines.iter().map(|line| line.progress().unwrap().env_steps));
             }
         };
         assert_eq!(read_all(&mut follower), many as usize);
@@ -355,16 +277,5 @@ mod tests {
         drop(metrics);
         assert!(!follower.more().await);
         assert!(read.into_iter().eq(0..=many));
-    }
-
-    #[test]
-    fn a_message_says_what_the_line_says() {
-        let message = line(9).to_message();
-        let training = message.training.unwrap();
-        assert_eq!((message.env_steps, message.episodes, message.updates), (9, 3, 2));
-        let measures: Vec<_> = training.measures.iter().map(|it| (it.name.as_str(), it.value)).collect();
-        assert_eq!((measures, training.epsilon), (vec![("td_loss", 1e-9), ("target_mean", -3.0)], 0.1 + 0.2));
-        let [task] = &message.tasks[..] else { panic!("{:?}", message.tasks) };
-        assert_eq!((task.task.as_str(), task.episodes, task.policy_lag), ("game-1", 5, Some(1)));
     }
 }

@@ -1,7 +1,8 @@
 //! What a learner finds of `metrics.jsonl` when it goes on: lines that are whole are kept, and what is not is said.
 
-use rit_config::{RunDir, open_regular};
-use serde::{Deserialize, Serialize};
+use rit_config::open_regular;
+use rit_record::{Header, OtherFile, is_header};
+use serde::{Deserialize, de::IgnoredAny};
 use std::{
     fs::{self, OpenOptions},
     io::{self, BufRead as _, BufReader, Seek as _, SeekFrom, Write as _},
@@ -10,76 +11,12 @@ use std::{
     path::{Path, PathBuf},
 };
 
-/// What the lines of this build look like. Raise it when a key's meaning changes.
-pub const METRICS_FORMAT: u32 = 1;
-
-/// The first line of the file: whose it is. The kind comes first, so that whoever reads lines can tell.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Header {
-    kind: String,
-    format_version: u32,
-    run_id: String,
-}
-
-/// How the first line begins.
-const HEADER: &[u8] = br#"{"kind":"run","#;
-
-/// Whether a line says whose file it is.
-pub(crate) fn is_header(line: &[u8]) -> bool {
-    line.starts_with(HEADER)
-}
-
-impl Header {
-    /// Of this run's file.
-    pub fn of(run_dir: &RunDir) -> Self {
-        let run_id = run_dir.lineage().iter().map(|byte| format!("{byte:02x}")).collect();
-        Self { kind: "run".into(), format_version: METRICS_FORMAT, run_id }
-    }
-
-    /// For tests that have no run directory.
-    #[cfg(test)]
-    pub(crate) fn of_test() -> Self {
-        Self { kind: "run".into(), format_version: METRICS_FORMAT, run_id: "ab".into() }
-    }
-
-    /// The line itself.
-    pub(crate) fn line(&self) -> io::Result<Vec<u8>> {
-        let mut line = serde_json::to_vec(self)?;
-        line.push(b'\n');
-        Ok(line)
-    }
-
-    fn check(&self, line: &[u8]) -> Result<(), MetricsError> {
-        let found: Self = serde_json::from_slice(line).map_err(|error| MetricsError::Io(error.into()))?;
-        match found {
-            Self { format_version, .. } if format_version != self.format_version => {
-                Err(MetricsError::Format { found: format_version })
-            }
-            Self { run_id, .. } if run_id != self.run_id => Err(MetricsError::OtherRun { found: run_id }),
-            _ => Ok(()),
-        }
-    }
-}
-
 /// Why a learner cannot go on with the file.
 #[derive(Debug, thiserror::Error)]
 pub enum MetricsError {
-    /// Another run's.
-    #[error(
-        "it is of another run ({found}); move it away, and the lines up to the checkpoint are missed, nothing else"
-    )]
-    OtherRun {
-        /// That run.
-        found: String,
-    },
-    /// Another build's.
-    #[error(
-        "it has format version {found}, this build writes {METRICS_FORMAT}; go on with the build that wrote it"
-    )]
-    Format {
-        /// Its version.
-        found: u32,
-    },
+    /// Another run's, or another build's.
+    #[error(transparent)]
+    OtherFile(#[from] OtherFile),
     /// The system refused.
     #[error(transparent)]
     Io(#[from] io::Error),
@@ -98,6 +35,15 @@ pub struct End {
 #[derive(Deserialize)]
 struct Any {
     env_steps: u64,
+    /// Of an evaluation that was not due: it was made at a run's end, behind the last checkpoint.
+    occasion: Option<IgnoredAny>,
+}
+
+impl Any {
+    /// Whether a learner that goes on from a checkpoint at so many steps will come to this line again.
+    fn is_behind(&self, env_steps: u64) -> bool {
+        self.env_steps > env_steps || self.occasion.is_some()
+    }
 }
 
 /// What lies in the file up to an end.
@@ -131,12 +77,12 @@ impl Lines {
             let range = at..at + read;
             at = range.end;
             if range.start == 0 && is_header(&line) && line.ends_with(b"\n") {
-                header.check(&line)?;
+                header.check(&serde_json::from_slice(&line).map_err(io::Error::from)?)?;
                 lines.whole.push(range);
                 continue;
             }
             match serde_json::from_slice::<Any>(&line) {
-                Ok(any) if any.env_steps > until_env_steps => return Ok(lines),
+                Ok(any) if any.is_behind(until_env_steps) => return Ok(lines),
                 Ok(any) if line.ends_with(b"\n") => {
                     (lines.broken, lines.last) = (lines.broken + broken_since, any.env_steps);
                     broken_since = 0;
@@ -244,7 +190,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("metrics.jsonl");
         fs::write(&path, text).unwrap();
-        let (len, warning) = repair(&path, &Header::of_test(), end()).unwrap();
+        let (len, warning) = repair(&path, &Header::of("ab".into(), None), end()).unwrap();
         let left = fs::read_to_string(&path).unwrap();
         assert_eq!(left.len() as u64, len);
         if let Some(damaged) = warning.as_ref().filter(|warning| warning.contains("damaged")) {
@@ -270,6 +216,14 @@ mod tests {
     }
 
     #[test]
+    fn what_was_measured_at_a_former_end_goes_without_a_word() {
+        let kept = &whole()[..end().len as usize];
+        let at_the_end = line(20).replace("\"td_loss\"", "\"occasion\":\"final\",\"td_loss\"");
+        let best = at_the_end.replace(":20", ":10").replace("final", "best");
+        assert_eq!(repaired(&format!("{kept}{at_the_end}{best}")), (kept.to_owned(), None));
+    }
+
+    #[test]
     fn what_is_missing_is_said_and_the_last_whole_line_is_the_end() {
         let (all, kept) = (whole(), whole()[..end().len as usize].to_owned());
         let two = &all[..all.find(&line(20)).unwrap()];
@@ -283,7 +237,8 @@ mod tests {
         let (left, warning) = repaired("");
         assert!(left.is_empty() && warning.unwrap().contains("ends at 0 steps"));
         let gone = tempfile::tempdir().unwrap();
-        let (len, warning) = repair(&gone.path().join("metrics.jsonl"), &Header::of_test(), end()).unwrap();
+        let (len, warning) =
+            repair(&gone.path().join("metrics.jsonl"), &Header::of("ab".into(), None), end()).unwrap();
         assert!(len == 0 && warning.unwrap().ends_with("is gone: a new one begins at 20 steps"));
     }
 
@@ -309,7 +264,7 @@ mod tests {
             (whole().replace("\"format_version\":1", "\"format_version\":9"), "it has format version 9"),
         ] {
             fs::write(&path, &text).unwrap();
-            let error = repair(&path, &Header::of_test(), end()).unwrap_err().to_string();
+            let error = repair(&path, &Header::of("ab".into(), None), end()).unwrap_err().to_string();
             assert!(error.contains(message), "{error}");
             assert_eq!(fs::read_to_string(&path).unwrap(), text);
         }

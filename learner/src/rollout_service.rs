@@ -1,16 +1,24 @@
 //! `rit.v1.Rollout`: turns an actor's stream into events.
 
-use crate::coordinator::{ACTOR_QUEUE, Event, Loss};
+use crate::{
+    coordinator::{ACTOR_QUEUE, Event, Loss},
+    cpu_time::CpuTime,
+};
 use rit_env::FailureKind;
 use rit_proto::v1::{self, ActorMessage, LearnerMessage, actor_message::Message, rollout_server};
-use std::pin::Pin;
+use std::{pin::Pin, sync::Arc};
 use tokio::sync::{mpsc, oneshot};
 use tokio_stream::{Stream, wrappers::ReceiverStream};
 use tonic::{Request, Response, Status, Streaming};
 
 /// `rit.v1.Rollout`.
 #[derive(Clone, Debug)]
-pub struct RolloutService(pub mpsc::Sender<Event>);
+pub struct RolloutService {
+    /// To the coordinator.
+    pub events: mpsc::Sender<Event>,
+    /// What actors say of the processor time they take.
+    pub cpu: Arc<CpuTime>,
+}
 
 /// Longest name of an actor, in bytes.
 const NAME_BYTES_MAX: usize = 64;
@@ -53,19 +61,26 @@ impl rollout_server::Rollout for RolloutService {
             return Err(Status::invalid_argument("an actor's first message is Hello"));
         };
         check_name(&hello.name)?;
+        let instance = hello.instance;
         let (to, from_learner) = mpsc::channel(ACTOR_QUEUE);
         let (answer, joined) = oneshot::channel();
         let over = |_| Status::unavailable("the run is over");
-        self.0.send(Event::Join(hello, to, answer)).await.map_err(|_| over(()))?;
+        self.events.send(Event::Join(hello, to, answer)).await.map_err(|_| over(()))?;
         let actor = joined.await.map_err(|_| over(()))??;
-        let events = self.0.clone();
+        let (events, cpu) = (self.events.clone(), Arc::clone(&self.cpu));
         tokio::spawn(async move {
             // A message, the end, or an error: what is no message ends the actor's time here.
             while let Ok(Some(message)) = messages.message().await {
                 let event = match message.message {
-                    Some(Message::Done(done)) => Event::Done(actor, done.lease, losses(done.losses)),
+                    Some(Message::Done(done)) => {
+                        cpu.note(instance, done.cpu_ms);
+                        Event::Done(actor, done.lease, losses(done.losses))
+                    }
                     Some(Message::Leaving(_)) => Event::Leaving(actor),
-                    Some(Message::Heartbeat(_)) => Event::Heartbeat(actor),
+                    Some(Message::Heartbeat(heartbeat)) => {
+                        cpu.note(instance, heartbeat.cpu_ms);
+                        Event::Heartbeat(actor)
+                    }
                     Some(Message::Hello(_)) | None => continue,
                 };
                 if events.send(event).await.is_err() {

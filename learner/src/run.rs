@@ -4,6 +4,7 @@ use crate::{
     checkpoint::{self, CheckpointError, Loaded},
     control_service::ControlService,
     coordinator::{Coordinator, Event, Shell},
+    cpu_time::CpuTime,
     episodes_service::EpisodesService,
     initial::{InitialError, initial_params},
     life::{self, EndOfLife, LifeError},
@@ -11,8 +12,8 @@ use crate::{
     replay_log::{ReplayLog, ReplayLogError},
     rollout_service::RolloutService,
     run_handle::{RunHandle, SetLog},
-    summary::{Ended, Summary},
-    trainer::{TrainError, Trainer},
+    summary,
+    trainer::{Made, TrainError, Trainer},
     web::{Web, WebError},
     weights::WeightsService,
     write_queue::write_queue,
@@ -34,6 +35,7 @@ use rit_proto::{
         rollout_server::RolloutServer, weights_server::WeightsServer,
     },
 };
+use rit_record::{Build, Ended, Summary};
 use std::{
     fs, io,
     path::PathBuf,
@@ -112,14 +114,15 @@ pub enum LearnerError {
     Panicked(&'static str),
 }
 
-/// Runs a learner until T_max, until it is told to stop, or until `shutdown`, which means the same. `set_log` changes
-/// what it logs.
+/// Runs a learner until T_max, until it is told to stop, or until `shutdown`, which means the same. `build` is this program,
+/// for the run's record; `set_log` changes what it logs.
 ///
 /// # Errors
 /// When it cannot begin, or training fails.
 pub async fn run(
     run_dir: RunDir,
     config: Config,
+    build: Build,
     set_log: SetLog,
     shutdown: impl Future<Output = ()>,
 ) -> Result<Summary, LearnerError> {
@@ -156,7 +159,10 @@ pub async fn run(
         events: events.clone(),
     };
     let (to_write, write_queue) = write_queue(config.replay_episodes());
-    let (trainer, board) = Trainer::new(config.clone(), run_dir.clone(), learner, loaded, news, to_write)?;
+    let cpu = Arc::new(CpuTime::default());
+    let made = Made { build, cpu: Arc::clone(&cpu) };
+    let (trainer, board) =
+        Trainer::new(config.clone(), run_dir.clone(), learner, loaded, news, to_write, made)?;
     let metrics = trainer.metrics_follower();
     let welcome = Welcome { actor: 0, run_id: run_dir.run_id().to_vec(), config: config.to_toml()? };
     let mut beginning = trainer.beginning();
@@ -196,7 +202,7 @@ pub async fn run(
     let episode_bytes_max = episodes.message_bytes_max();
     let weights = WeightsServer::new(WeightsService(board));
     let control = ControlService { run: handle, metrics };
-    let rollout = RolloutServer::new(RolloutService(events.clone()));
+    let rollout = RolloutServer::new(RolloutService { events: events.clone(), cpu });
     let (health_reporter, health) = tonic_health::server::health_reporter();
     health_reporter.set_serving::<WeightsServer<WeightsService>>().await;
     health_reporter.set_serving::<RolloutServer<RolloutService>>().await;
@@ -255,7 +261,7 @@ pub async fn run(
     writing.await.map_err(|_| LearnerError::Panicked("write"))?;
     let ended = received.and_then(|()| Ok(trained??));
     if let Err(error) = &ended
-        && let Err(error) = Summary::write_failed(&run_dir, &error.to_string())
+        && let Err(error) = summary::write_failed(&run_dir, &error.to_string())
     {
         tracing::error!(%error, "summary.json was not written");
     }

@@ -2,7 +2,8 @@
 
 use crate::{
     coordinator::{Control, Event},
-    evaluation::{Evaluator, TaskResult, TasksError},
+    evaluation::{Evaluator, TasksError},
+    messages,
     trainer::{Checkpointed, evaluation_seed},
     weights::{Snapshot, WeightsBoard},
 };
@@ -208,11 +209,11 @@ impl RunHandle {
         };
         let seed = seed.map_or_else(|| evaluation_seed(&config), RunSeed);
         let evaluation = self.roll(move |acting, snapshot, given_up| {
-            let results = evaluator.evaluate_unless(acting, &tasks, episodes, seed, given_up)?;
+            let results = evaluator.evaluate_unless(&mut [acting], &tasks, episodes, seed, given_up)?;
             Ok::<_, AskError>(results.map(|results| v1::Evaluation {
                 env_steps: snapshot.env_steps,
                 weights_version: snapshot.version,
-                tasks: results.iter().map(TaskResult::to_message).collect(),
+                tasks: results.iter().map(messages::task_result).collect(),
             }))
         });
         // What was given up has nobody to answer to.
@@ -242,7 +243,7 @@ impl RunHandle {
     /// argument to give up.
     async fn roll<T: Send + 'static>(
         &self,
-        work: impl FnOnce(&mut Acting, &Arc<Snapshot>, &dyn Fn() -> bool) -> T + Send + 'static,
+        work: impl FnOnce(&mut Acting, &Arc<Snapshot>, &(dyn Fn() -> bool + Sync)) -> T + Send + 'static,
     ) -> Result<T, AskError> {
         let room = Arc::clone(&self.waiting).try_acquire_owned().map_err(|_| AskError::Busy)?;
         let turn = Arc::clone(&self.rollouts).acquire_owned().await.map_err(|_| AskError::Over)?;

@@ -6,10 +6,11 @@
 //! session's start: a TensorBoard that is running then forgets what it had seen from that step on; before it stands
 //! whose the file is. Files that end in part of a record are cut behind the last whole one.
 
-use crate::{append_file::AppendFile, evaluation::TaskResult, metrics::Line};
+use crate::append_file::AppendFile;
 use crc::{CRC_32_ISCSI, Crc};
 use prost::Message;
 use rit_config::RunDir;
+use rit_record::{Evaluation, Line, Occasion, TaskResult, TrainingPoint};
 use serde::{Deserialize, Serialize};
 use std::{
     collections::BTreeMap,
@@ -101,7 +102,10 @@ impl EventFile {
 
     /// Writes what a line says, or keeps it until the disk takes it.
     pub fn write(&mut self, line: &Line) {
-        self.append(line.progress().env_steps, What::Summary(summary(line)));
+        let summary = summary(line);
+        if let Some(progress) = line.progress().filter(|_| !summary.value.is_empty()) {
+            self.append(progress.env_steps, What::Summary(summary));
+        }
     }
 
     /// Writes what the disk has refused so far.
@@ -172,31 +176,35 @@ fn masked_crc(data: &[u8]) -> [u8; 4] {
 
 fn summary(line: &Line) -> Summary {
     let mut value = Vec::new();
-    let mut scalar = |tag: String, number: f64| value.push(Value { tag, simple_value: Some(number as f32) });
+    let scalar = |value: &mut Vec<Value>, tag: String, number: f64| {
+        value.push(Value { tag, simple_value: Some(number as f32) });
+    };
     let (group, tasks): (&str, &BTreeMap<String, TaskResult>) = match line {
-        Line::Training { epsilon, measured, tasks, progress, .. } => {
-            for (name, number) in &measured.0 {
-                scalar(format!("training/{name}"), *number);
+        Line::Training(TrainingPoint { epsilon, measured, tasks, progress, .. }) => {
+            for (name, number) in &measured.values {
+                scalar(&mut value, format!("training/{name}"), *number);
             }
             for (name, number) in [
                 ("epsilon", *epsilon),
                 ("episodes", progress.episodes as f64),
                 ("updates", progress.updates as f64),
             ] {
-                scalar(format!("training/{name}"), number);
+                scalar(&mut value, format!("training/{name}"), number);
             }
             ("exploring", tasks)
         }
-        Line::Evaluation { tasks, .. } => ("greedy", tasks),
+        Line::Evaluation(Evaluation { occasion: Occasion::Scheduled, tasks, .. }) => ("greedy", tasks),
+        // What is measured at a run's end is no point of its curves.
+        Line::Evaluation(_) | Line::Other(_) => return Summary { value },
     };
     for (task, result) in tasks {
-        scalar(format!("{group}_return/{task}"), result.mean_return);
+        scalar(&mut value, format!("{group}_return/{task}"), result.mean_return);
         if let Some(win_rate) = result.win_rate {
-            scalar(format!("{group}_win_rate/{task}"), win_rate);
+            scalar(&mut value, format!("{group}_win_rate/{task}"), win_rate);
         }
         if let Some(exploring) = result.exploring {
-            scalar(format!("policy_lag/{task}"), exploring.policy_lag as f64);
-            scalar(format!("episodes/{task}"), exploring.episodes_total as f64);
+            scalar(&mut value, format!("policy_lag/{task}"), exploring.policy_lag as f64);
+            scalar(&mut value, format!("episodes/{task}"), exploring.episodes_total as f64);
         }
     }
     Summary { value }
@@ -262,8 +270,9 @@ enum SessionStatus {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{checkpoint::Progress, evaluation::Exploring, measured::Measured};
     use rit_config::OwnedRunDir;
+    use rit_env::Split;
+    use rit_record::{Exploring, Progress};
     use std::path::PathBuf;
 
     /// The events of a file, both checksums of each verified.
@@ -331,14 +340,19 @@ mod tests {
 
     fn evaluation(env_steps: u64) -> Line {
         let result = TaskResult {
-            task: String::new(),
+            task: "game-1".to_owned(),
             episodes: 32,
             mean_return: -2.5,
             win_rate: Some(0.75),
-            exploring: None,
+            ..TaskResult::default()
         };
-        let tasks = BTreeMap::from([("game-1".to_owned(), result)]);
-        Line::Evaluation { progress: progress(env_steps), wall_s: 1.0, tasks }
+        Line::Evaluation(Evaluation::new(
+            progress(env_steps),
+            1.0,
+            Occasion::Scheduled,
+            Split::Training,
+            &[result],
+        ))
     }
 
     #[test]
@@ -355,13 +369,14 @@ mod tests {
         let (mut events, _) = run.create(&Position::default(), 0);
         events.write(&evaluation(0));
         let measured = [("td_loss", 0.5), ("grad_norm", 3.0), ("q_total_mean", 0.0), ("target_mean", -1.5)];
-        let measured = Measured(measured.map(|(name, value)| (name.to_owned(), value)).to_vec());
+        let measured = measured.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
         let exploring = Some(Exploring { episodes_total: 9, policy_lag: 1 });
-        let result =
-            TaskResult { task: String::new(), episodes: 9, mean_return: 4.5, win_rate: None, exploring };
+        let result = TaskResult { episodes: 9, mean_return: 4.5, exploring, ..TaskResult::default() };
         let tasks = BTreeMap::from([("3v3".to_owned(), result)]);
-        let line = Line::Training { progress: progress(100), wall_s: 2.0, epsilon: 0.125, measured, tasks };
-        events.write(&line);
+        let point = TrainingPoint { progress: progress(100), wall_s: 2.0, epsilon: 0.125, measured, tasks };
+        events.write(&Line::Training(point));
+        let Line::Evaluation(last) = evaluation(100) else { panic!("it is one") };
+        events.write(&Line::Evaluation(Evaluation { occasion: Occasion::Final, ..last }));
         let files = read_all(&run.folder());
         assert_eq!(files.len(), 1);
         assert_eq!(files[0][0].what, Some(What::FileVersion("brain.Event:2".into())));

@@ -4,14 +4,13 @@
 mod ending;
 
 use crate::{
-    checkpoint::{Loaded, Manifest, Origin, Progress, SnapshotMark, TrainingState},
-    evaluation::{Evaluator, TaskResult, by_task, in_words},
+    checkpoint::{Loaded, Manifest, Origin, SnapshotMark, TrainingState},
+    cpu_time::CpuTime,
+    evaluation::Evaluator,
     ledger::Terms,
-    measured::Measured,
-    metrics::{Follower, Line, MetricsFile, Recent},
-    metrics_repair::{End, Header, MetricsError},
+    metrics::{Follower, MetricsFile, Recent},
+    metrics_repair::{End, MetricsError},
     replay::Replay,
-    summary::{Ended, Summary},
     tensorboard::{EventFile, Position},
     weights::{Snapshot, WeightsBoard},
     write_queue::WriteQueue,
@@ -21,10 +20,14 @@ use rit_algo::{
     Acting, Learner, Regime,
     learner::{Draw, Measure, NamedState, NotFinite, StateError},
 };
-use rit_config::{Config, RunDir, Until};
+use rit_config::{Config, KeepBest, RunDir, Until};
 use rit_env::{Split, rollout::LostEpisode};
-use rit_episode::{Episode, RunSeed, Stream};
+use rit_episode::{Episode, Policy, RunSeed, Stream};
 use rit_policy::weights_file;
+use rit_record::{
+    Best, Build, Ended, Evaluation, Header, Line, Measured, Occasion, Progress, Run, Summary, TaskResult,
+    TrainingPoint, in_words,
+};
 use std::{
     collections::VecDeque,
     fs, io,
@@ -66,7 +69,7 @@ pub struct Standing {
     pub measured: Measured,
     /// Exploring episodes of late.
     pub recent: Vec<TaskResult>,
-    /// The newest scheduled evaluation, with the progress it was made at.
+    /// The newest scheduled evaluation of the training tasks, with the progress it was made at: means.
     pub evaluation: Option<(Progress, Vec<TaskResult>)>,
     /// Episodes in replay.
     pub replay_episodes: usize,
@@ -157,6 +160,22 @@ pub struct Trainer {
     warnings: Vec<String>,
     /// What checkpoints say of where they come from.
     origin: Origin,
+    made: Made,
+    /// Seconds of processor time that learners before this one and their actors took.
+    cpu_before_s: f64,
+    /// The newest scheduled evaluation of this learner, episode by episode.
+    evaluated: Option<(Progress, Vec<TaskResult>)>,
+    /// The best policy so far with its parameters, where it is kept.
+    best: Option<(Best, Vec<f32>)>,
+}
+
+/// What a run is made with, for its record.
+#[derive(Clone, Debug, Default)]
+pub struct Made {
+    /// This program.
+    pub build: Build,
+    /// What the run's processes take.
+    pub cpu: Arc<CpuTime>,
 }
 
 /// Where a run begins: what the rest of the learner needs to know of it.
@@ -187,6 +206,7 @@ impl Trainer {
         loaded: Option<Loaded>,
         news: Box<dyn FnMut(News) + Send>,
         writer: WriteQueue,
+        made: Made,
     ) -> Result<(Self, Arc<WeightsBoard>), TrainError> {
         let lag = config.algorithm.policy_lag;
         let first = Snapshot::new(0, 0, acting_params(&*learner));
@@ -195,9 +215,11 @@ impl Trainer {
         let tasks = config.tasks(Split::Training).iter().map(ToString::to_string).collect();
         let mut warnings = loaded.as_ref().map(|loaded| loaded.warnings.clone()).unwrap_or_default();
         let manifest = loaded.as_ref().map(|loaded| &loaded.state.manifest);
+        let run = Run::begins(&config, made.build.clone(), learner.params().len(), learner.measures())?;
+        let header = Header::new(&run_dir, run);
         // Of the checkpoint's own the log tells already.
         let logged = warnings.len();
-        let (metrics, tensorboard) = files(&run_dir, manifest, &mut warnings)?;
+        let (metrics, tensorboard) = files(&run_dir, &header, manifest, &mut warnings)?;
         warnings.iter().skip(logged).for_each(|warning| tracing::warn!("{warning}"));
         let mut trainer = Self {
             replay: (learner.regime() == Regime::Replay).then(|| Replay::new(config.algorithm.buffer_size)),
@@ -214,6 +236,10 @@ impl Trainer {
             writer,
             warnings,
             origin: Origin::of(&run_dir, &config)?,
+            cpu_before_s: manifest.map_or(0.0, |manifest| manifest.cpu_s),
+            made,
+            evaluated: None,
+            best: None,
             learner,
             run_dir,
             config,
@@ -242,7 +268,10 @@ impl Trainer {
     }
 
     fn go_on_from(&mut self, loaded: Loaded) -> Result<(), StateError> {
-        let TrainingState { params, learner, snapshots, manifest } = loaded.state;
+        let TrainingState { params, best, learner, snapshots, manifest } = loaded.state;
+        let kept_by = self.config.checkpoints.keep_best.name();
+        // By another measure none of the evaluations before says which was the best.
+        self.best = manifest.best.filter(|best| best.measure == kept_by).zip(best);
         self.learner.restore(&params, &learner)?;
         self.target_copied_at = manifest.target_copied_at;
         self.env_steps_before = manifest.env_steps_before;
@@ -291,6 +320,9 @@ impl Trainer {
     fn train_until_over(&mut self, work: &mpsc::Receiver<Work>) -> Result<Ended, TrainError> {
         if self.standing.evaluation.is_none() {
             self.evaluate()?;
+            if self.config.evaluation.testing_every_env_steps > 0 {
+                self.evaluate_testing()?;
+            }
         }
         loop {
             if let Some(ended) = self.over() {
@@ -324,6 +356,7 @@ impl Trainer {
                     let other_result = self.config.algorithm != config.algorithm
                         || self.config.evaluation != config.evaluation;
                     self.config = Config::clone(&config);
+                    self.evaluator = Evaluator::new(&config);
                     self.origin = Origin::of(&self.run_dir, &config)?;
                     if other_result {
                         // What was trained so far is not trained again under other settings.
@@ -379,17 +412,22 @@ impl Trainer {
         self.standing.recent = self.recent.results();
         if self.is_due(self.config.learner.metrics_every_env_steps) {
             let standing = &self.standing;
-            let line = Line::Training {
+            let tasks = standing.recent.iter().map(|result| (result.task.clone(), result.clone()));
+            let point = TrainingPoint {
                 progress: after,
                 wall_s: self.metrics.wall_s(),
                 epsilon: self.config.epsilon(after.env_steps).into(),
                 measured: standing.measured.clone(),
-                tasks: by_task(&standing.recent),
+                tasks: tasks.collect(),
             };
-            self.measured(&line)?;
+            self.measured(&Line::Training(point))?;
         }
         if self.is_due(self.config.evaluation.every_env_steps) {
             self.evaluate()?;
+        }
+        let testing_every = self.config.evaluation.testing_every_env_steps;
+        if testing_every > 0 && self.is_due(testing_every) {
+            self.evaluate_testing()?;
         }
         Ok(())
     }
@@ -398,12 +436,48 @@ impl Trainer {
     /// differ by the weights alone.
     fn evaluate(&mut self) -> Result<(), TrainError> {
         let progress = self.standing.progress;
-        let results = self.greedy(self.config.evaluation.episodes)?;
-        let line = Line::Evaluation { progress, wall_s: self.metrics.wall_s(), tasks: by_task(&results) };
-        self.measured(&line)?;
+        let results = self.greedy(Split::Training)?;
+        self.record_evaluation(Occasion::Scheduled, Split::Training, &results)?;
         tracing::info!(env_steps = progress.env_steps, results = %in_words(&results), "evaluated");
-        self.standing.evaluation = Some((progress, results));
+        self.keep_if_best(&results);
+        self.standing.evaluation = Some((progress, results.iter().map(TaskResult::means).collect()));
+        self.evaluated = Some((progress, results));
         Ok(())
+    }
+
+    /// Keeps the policy if it is better than all before it; of equals the first is kept.
+    fn keep_if_best(&mut self, results: &[TaskResult]) {
+        let keep_best = self.config.checkpoints.keep_best;
+        let Some(value) = measure(keep_best, results) else { return };
+        if self.best.as_ref().is_some_and(|(best, _)| best.value >= value) {
+            return;
+        }
+        let (measure, progress) = (keep_best.name().to_owned(), self.standing.progress);
+        tracing::info!(env_steps = progress.env_steps, measure, value, "the best policy so far");
+        let params = self.learner.params().to_vec();
+        let weights_digest = weights_file::digest(&params);
+        self.best = Some((Best { measure, value, progress, weights_digest, ..Best::default() }, params));
+    }
+
+    /// The scheduled evaluation of the testing tasks, if there are any: nothing is decided by it.
+    fn evaluate_testing(&mut self) -> Result<(), TrainError> {
+        let results = self.greedy(Split::Testing)?;
+        if !results.is_empty() {
+            self.record_evaluation(Occasion::Scheduled, Split::Testing, &results)?;
+            let env_steps = self.standing.progress.env_steps;
+            tracing::info!(env_steps, results = %in_words(&results), "evaluated testing tasks");
+        }
+        Ok(())
+    }
+
+    fn record_evaluation(
+        &mut self,
+        occasion: Occasion,
+        split: Split,
+        results: &[TaskResult],
+    ) -> Result<(), TrainError> {
+        let (progress, wall_s) = (self.standing.progress, self.metrics.wall_s());
+        self.measured(&Line::Evaluation(Evaluation::new(progress, wall_s, occasion, split, results)))
     }
 
     fn measured(&mut self, line: &Line) -> Result<(), TrainError> {
@@ -412,10 +486,28 @@ impl Trainer {
         Ok(())
     }
 
-    fn greedy(&self, episodes: usize) -> Result<Vec<TaskResult>, LostEpisode> {
-        let mut acting = Acting::new(self.learner.model(), acting_params(&*self.learner));
-        let tasks = self.config.tasks(Split::Training);
-        self.evaluator.evaluate(&mut acting, &tasks, episodes, evaluation_seed(&self.config))
+    /// The run's own greedy episodes of one split's tasks with the present weights.
+    fn greedy(&self, split: Split) -> Result<Vec<TaskResult>, LostEpisode> {
+        self.roll(acting_params(&*self.learner), split, None, evaluation_seed(&self.config))
+    }
+
+    /// Greedy episodes, on all threads of updates, which have nothing to do meanwhile.
+    fn roll(
+        &self,
+        acting_params: &[f32],
+        split: Split,
+        episodes: Option<usize>,
+        seed: RunSeed,
+    ) -> Result<Vec<TaskResult>, LostEpisode> {
+        let new = |_| Acting::new(self.learner.model(), acting_params);
+        let mut policies: Vec<_> = (0..self.config.learner.threads).map(new).collect();
+        let mut policies: Vec<_> = policies.iter_mut().map(|policy| policy as &mut dyn Policy).collect();
+        self.evaluator.evaluate(&mut policies, &self.config.tasks(split), episodes, seed)
+    }
+
+    /// Seconds of processor time that the run has taken.
+    fn cpu_s(&self) -> f64 {
+        self.cpu_before_s + self.made.cpu.seconds()
     }
 
     /// How the run ends, if all steps are done or an evaluation made just now says that it is enough. What a checkpoint
@@ -457,6 +549,7 @@ impl Trainer {
         });
         let state = TrainingState {
             params: self.learner.params().to_vec(),
+            best: self.best.as_ref().map(|(_, params)| params.clone()),
             learner: self.learner.state().into_iter().map(NamedState::into_owned).collect(),
             manifest: Manifest {
                 origin: self.origin.clone(),
@@ -470,7 +563,9 @@ impl Trainer {
                 metrics_len: self.metrics.len(),
                 tensorboard: self.tensorboard.position(),
                 wall_s: self.metrics.wall_s(),
+                cpu_s: self.cpu_s(),
                 evaluation,
+                best: self.best.as_ref().map(|(best, _)| best.clone()),
                 weights_digest: weights_digest.clone(),
             },
             snapshots: kept.iter().map(|snapshot| Snapshot::clone(snapshot)).collect(),
@@ -481,6 +576,17 @@ impl Trainer {
     }
 }
 
+/// What a policy is the best by: the mean over tasks. None where none is kept, or what is no number.
+fn measure(keep_best: KeepBest, results: &[TaskResult]) -> Option<f64> {
+    let of_task = |result: &TaskResult| match keep_best {
+        KeepBest::Never => None,
+        KeepBest::MeanReturn => Some(result.mean_return),
+        KeepBest::WinRate => result.win_rate,
+    };
+    let sum: f64 = results.iter().map(of_task).sum::<Option<f64>>()?;
+    Some(sum / results.len() as f64).filter(|value| value.is_finite())
+}
+
 /// The weights that actors need.
 fn acting_params(learner: &dyn Learner) -> &[f32] {
     &learner.params()[learner.model().acting()]
@@ -489,20 +595,21 @@ fn acting_params(learner: &dyn Learner) -> &[f32] {
 /// The files that show how training goes: begun, or continued from a checkpoint. What was repaired is said.
 fn files(
     run_dir: &RunDir,
+    header: &Header,
     manifest: Option<&Manifest>,
     warnings: &mut Vec<String>,
 ) -> Result<(MetricsFile, EventFile), TrainError> {
     let wall_s = manifest.map_or(0.0, |manifest| manifest.wall_s);
     let end = manifest
         .map(|Manifest { progress, metrics_len: len, .. }| End { env_steps: progress.env_steps, len: *len });
-    let (path, header) = (run_dir.metrics(), Header::of(run_dir));
+    let path = run_dir.metrics();
     if manifest.is_none() && fs::metadata(&path).is_ok_and(|metadata| metadata.len() > 0) {
         warnings.push(
             "no checkpoint was written yet: training begins again at step 0, and metrics.jsonl with it"
                 .into(),
         );
     }
-    let metrics = MetricsFile::open(&path, &header, end, wall_s);
+    let metrics = MetricsFile::open(&path, header, end, wall_s);
     let (metrics, warning) = metrics.map_err(|error| TrainError::Metrics { path, error })?;
     warnings.extend(warning);
     let (position, from) = manifest.map_or((Position::default(), 0), |manifest| {

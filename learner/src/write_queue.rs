@@ -143,12 +143,13 @@ impl Drop for WriteQueueReader {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::checkpoint::{Manifest, Progress};
+    use crate::checkpoint::Manifest;
     use rit_env::{
         Embedded, Script, Split, TaskSet,
         rollout::{Job, Rollout},
     };
     use rit_episode::{Choice, RunSeed};
+    use rit_record::Progress;
 
     fn episode() -> Arc<Episode> {
         let tasks = TaskSet::MatrixGame.tasks(Split::Training);
@@ -160,7 +161,7 @@ mod tests {
     fn state(env_steps: u64) -> Box<TrainingState> {
         let progress = Progress { env_steps, ..Progress::default() };
         let manifest = Manifest { progress, ..Manifest::default() };
-        Box::new(TrainingState { params: vec![], learner: vec![], snapshots: vec![], manifest })
+        Box::new(TrainingState { params: vec![], best: None, learner: vec![], snapshots: vec![], manifest })
     }
 
     /// What waits, in order: an episode, or a state's steps and how many wait for it.

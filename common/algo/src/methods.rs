@@ -49,7 +49,7 @@ pub fn learner(
 pub struct Acting(Box<dyn Actor>);
 
 /// What a method's acting networks must do.
-pub(crate) trait Actor: Policy + Send {
+pub(crate) trait Actor: Policy {
     /// Utilities, or logits, of the last step.
     fn utilities(&self) -> &[f32];
 

@@ -5,6 +5,7 @@ use crate::{
     keys::quoted,
     method_keys::{self, by_name},
     number,
+    resolve::is_free,
 };
 use rit_algo::{
     Method, ModelConfig, PpoConfig, Regime, RoleConfig, TerminalStates, UpdateConfig, method::Encoder,
@@ -262,7 +263,9 @@ impl From<Until> for String {
 pub struct Evaluation {
     pub every_env_steps: u64,
     pub episodes: usize,
+    pub testing_every_env_steps: u64,
     pub testing_episodes: usize,
+    pub absolute_metric: bool,
 }
 
 /// `[checkpoints]`.
@@ -272,8 +275,50 @@ pub struct Evaluation {
 pub struct Checkpoints {
     pub every_env_steps: u64,
     pub keep: usize,
+    pub keep_best: KeepBest,
     pub last_retry_ms: u64,
     pub rescue_dir: String,
+}
+
+/// The measure that the best policy is kept by: a mean over the training tasks of a scheduled evaluation.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum KeepBest {
+    /// None is kept.
+    Never,
+    /// Mean return.
+    MeanReturn,
+    /// Share of episodes won.
+    WinRate,
+}
+
+impl KeepBest {
+    /// The measure as it is typed; empty where none is kept.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Never => "",
+            Self::MeanReturn => "mean_return",
+            Self::WinRate => "win_rate",
+        }
+    }
+}
+
+impl TryFrom<String> for KeepBest {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        let known = [Self::Never, Self::MeanReturn, Self::WinRate];
+        known.into_iter().find(|it| it.name() == text).ok_or_else(|| {
+            let text = quoted(&text);
+            format!("checkpoints.keep_best = {text}; write mean_return, win_rate, or nothing between quotation marks")
+        })
+    }
+}
+
+impl From<KeepBest> for String {
+    fn from(keep_best: KeepBest) -> Self {
+        keep_best.name().to_owned()
+    }
 }
 
 /// `[actors]`.
@@ -376,7 +421,17 @@ impl Config {
     /// # Errors
     /// When TOML cannot say it.
     pub fn result_settings(&self) -> Result<BTreeMap<String, String>, ConfigError> {
-        crate::resolve::result_settings(self)
+        let mut settings = self.settings()?;
+        settings.retain(|key, _| !is_free(key));
+        Ok(settings)
+    }
+
+    /// Every `section.key` that the method has with its value, texts without quotation marks.
+    ///
+    /// # Errors
+    /// When TOML cannot say it.
+    pub fn settings(&self) -> Result<BTreeMap<String, String>, ConfigError> {
+        crate::resolve::settings(self)
     }
 
     /// The text that [`resolve`](crate::resolve) makes the same configuration of.
@@ -578,6 +633,7 @@ impl Config {
             ("training.t_max", self.training.t_max.into(), 1.0, STEPS),
             ("evaluation.every_env_steps", evaluation.every_env_steps.into(), 1.0, STEPS),
             ("evaluation.episodes", evaluation.episodes.into(), 1.0, COUNT),
+            ("evaluation.testing_every_env_steps", evaluation.testing_every_env_steps.into(), 0.0, STEPS),
             ("evaluation.testing_episodes", evaluation.testing_episodes.into(), 1.0, COUNT),
             ("checkpoints.every_env_steps", self.checkpoints.every_env_steps.into(), 1.0, STEPS),
             ("checkpoints.keep", self.checkpoints.keep.into(), 1.0, COUNT),

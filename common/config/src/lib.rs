@@ -20,7 +20,7 @@ mod run_place;
 mod saved;
 
 pub use config::{
-    Actors, Algorithm, Backend, Checkpoints, Config, Environment, Evaluation, Learner, Network,
+    Actors, Algorithm, Backend, Checkpoints, Config, Environment, Evaluation, KeepBest, Learner, Network,
     OptimizerName, SpawnRotate, StarCraft, Tls, Training, Until, Web, WebListen, World,
 };
 pub use error::ConfigError;
@@ -28,6 +28,6 @@ pub use foreign::{PythonAsked, python_answered, python_asked};
 pub use number::{CountError, WHOLE_MAX, count};
 pub use owned_run_dir::OwnedRunDir;
 pub use regular_file::{TEXT_BYTES_MAX, open_regular, read_regular, read_text, write_whole};
-pub use resolve::{all_keys, is_live, keys_like, resolve, set, set_live};
+pub use resolve::{all_keys, is_free, is_live, keys_like, resolve, set, set_live};
 pub use run_dir::{RunDir, RunDirError};
 pub use run_lock::RunLock;

@@ -1,6 +1,8 @@
 //! From what a person typed to a [`Config`].
 
-use crate::{Backend, Config, ConfigError, Environment, SpawnRotate, Until, foreign, keys, method_keys};
+use crate::{
+    Backend, Config, ConfigError, Environment, KeepBest, SpawnRotate, Until, foreign, keys, method_keys,
+};
 use rit_algo::{Method, Regime};
 use rit_env::{
     TaskSet,
@@ -49,6 +51,18 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
     let task_set = config.environment.task_set;
     if matches!(config.training.until, Until::WinRate(_)) && !task_set.has_wins() {
         return Err(ConfigError::NoWins { until: config.training.until.into(), task_set });
+    }
+    if config.checkpoints.keep_best == KeepBest::WinRate && !task_set.has_wins() {
+        return Err(ConfigError::Value(format!(
+            "checkpoints.keep_best = \"win_rate\": the tasks of {task_set} know no winning; write mean_return"
+        )));
+    }
+    if config.evaluation.absolute_metric && config.checkpoints.keep_best == KeepBest::Never {
+        return Err(ConfigError::Value(
+            "evaluation.absolute_metric evaluates the best policy, and none is kept; set checkpoints.keep_best to \
+             mean_return or win_rate"
+                .to_owned(),
+        ));
     }
     let Environment { training_tasks, testing_tasks, spawn_rotate, stats, enemy_medivac, .. } =
         &config.environment;
@@ -164,10 +178,12 @@ const FREE: [&str; 16] = [
 
 /// Keys that a running learner can change. Of these `algorithm.epsilon_finish` changes the
 /// result, and `evaluation` does where `training.until` ends the run at an evaluation.
-pub(crate) const LIVE: [&str; 10] = [
+pub(crate) const LIVE: [&str; 12] = [
     "algorithm.epsilon_finish",
     "evaluation.every_env_steps",
     "evaluation.episodes",
+    "evaluation.testing_every_env_steps",
+    "evaluation.testing_episodes",
     "checkpoints.every_env_steps",
     "checkpoints.last_retry_ms",
     "checkpoints.rescue_dir",
@@ -218,7 +234,7 @@ fn is_under(key: &str, keys: &[&str]) -> bool {
 }
 
 /// Whether no weight follows from a key.
-pub(crate) fn is_free(key: &str) -> bool {
+pub fn is_free(key: &str) -> bool {
     is_under(key, &FREE)
 }
 
@@ -239,14 +255,13 @@ pub(crate) fn flat(config: &Config) -> Result<BTreeMap<String, Value>, ConfigErr
     Ok(keys)
 }
 
-/// See [`Config::result_settings`].
-pub(crate) fn result_settings(config: &Config) -> Result<BTreeMap<String, String>, ConfigError> {
-    let keys = flat(config)?.into_iter().filter(|(key, _)| !is_under(key, &FREE));
+/// See [`Config::settings`].
+pub(crate) fn settings(config: &Config) -> Result<BTreeMap<String, String>, ConfigError> {
     let shown = |value: Value| match value {
         Value::String(text) => text,
         value => value.to_string(),
     };
-    Ok(keys.map(|(key, value)| (key, shown(value))).collect())
+    Ok(flat(config)?.into_iter().map(|(key, value)| (key, shown(value))).collect())
 }
 
 /// Whether a running learner can change this key.
@@ -567,6 +582,24 @@ mod tests {
                 )
             );
         }
+    }
+
+    #[test]
+    fn a_best_policy_is_kept_by_what_its_tasks_know() {
+        let kept = |text: &str| with(&[text]).unwrap().checkpoints.keep_best;
+        assert_eq!(kept("checkpoints.keep_best=win_rate"), KeepBest::WinRate);
+        assert_eq!((kept("checkpoints.keep_best="), kept("seed=1")), (KeepBest::Never, KeepBest::Never));
+        assert!(
+            refused(&["checkpoints.keep_best=loss"])
+                .starts_with("checkpoints.keep_best = \"loss\"; write mean_return")
+        );
+        assert!(
+            refused(&["evaluation.absolute_metric=true"])
+                .contains("set checkpoints.keep_best to mean_return")
+        );
+        assert!(with(&["evaluation.absolute_metric=true", "checkpoints.keep_best=mean_return"]).is_ok());
+        let text = "environment.task_set = \"predator-prey\"\ncheckpoints.keep_best = \"win_rate\"";
+        assert!(refused_file(text).contains("the tasks of predator-prey know no winning; write mean_return"));
     }
 
     #[test]

@@ -37,9 +37,11 @@ pub enum TaskSet {
 pub const PYTHON: &str = "python";
 
 /// Tasks are trained on or kept for zero-shot evaluation.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Split {
     /// Tasks to learn from.
+    #[default]
     Training,
     /// Tasks never seen in training.
     Testing,

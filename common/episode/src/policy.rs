@@ -21,7 +21,7 @@ pub struct Turn<'a> {
 ///
 /// What one episode gets must not depend on which others run beside it, or the same seed would end
 /// elsewhere with another number of actors.
-pub trait Policy {
+pub trait Policy: Send {
     /// A new episode begins in this slot: what was remembered of the last one is forgotten.
     fn begin(&mut self, slot: usize, n_agents: usize);
 

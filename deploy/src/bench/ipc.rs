@@ -1,11 +1,12 @@
 //! Episode frames through shared memory, end to end: a sender and a receiver on a thread each, as actor and
 //! learner have them, beside two plain copies of the same bytes.
 
-use super::{Report, cpu_s, thread_cpu_s};
+use super::{Report, thread_cpu_s};
 use crate::failure::Failure;
 use bytemuck::Zeroable as _;
 use rit_episode::wire::{ALIGNMENT, Frame, Header};
 use rit_ipc::{EpisodeReceiver, EpisodeSender, Limits, RunSpace};
+use rit_record::cpu_seconds;
 use std::{
     hint::{self, black_box},
     sync::{
@@ -71,7 +72,7 @@ fn transfer(space: &RunSpace, payload_len: usize, duration: Duration) -> Result<
             }
             Ok(())
         });
-        let (cpu, begun) = (cpu_s(), Instant::now());
+        let (cpu, begun) = (cpu_seconds(), Instant::now());
         let received = loop {
             while let Some(frame) = receiver.receive().map_err(Failure::runtime)? {
                 replay[place..place + payload_len].copy_from_slice(frame.payload());
@@ -84,7 +85,7 @@ fn transfer(space: &RunSpace, payload_len: usize, duration: Duration) -> Result<
             }
             receiver.wait(WAIT).map_err(Failure::runtime)?;
         };
-        let cpu = cpu_s() - cpu;
+        let cpu = cpu_seconds() - cpu;
         sending.join().map_err(|_| Failure::runtime_message("the sending thread panicked"))??;
         Ok((received, cpu))
     })

@@ -1,12 +1,13 @@
 //! One learner update, as training makes it.
 
-use super::{Measured, Report, cpu_s, random_episodes, thread_cpu_s};
+use super::{Measured, Report, random_episodes, thread_cpu_s};
 use crate::failure::Failure;
 use rit_algo::{Learner, Regime, learner::Draw};
 use rit_env::{Split, Task};
 use rit_episode::Stream;
 use rit_learner::replay::Replay;
 use rit_nn::{Accum, View, ViewMut, matmul};
+use rit_record::cpu_seconds;
 use std::{
     fs,
     sync::Arc,
@@ -83,7 +84,7 @@ pub(super) fn measure(
     for _ in 0..3 {
         one_update(&mut *learner)?;
     }
-    let (cpu, wall, flops) = (cpu_s(), Instant::now(), matmul::flops());
+    let (cpu, wall, flops) = (cpu_seconds(), Instant::now(), matmul::flops());
     let mut updates = 0;
     while wall.elapsed() < duration || updates < 3 {
         one_update(&mut *learner)?;
@@ -91,7 +92,7 @@ pub(super) fn measure(
     }
     Ok(Cost {
         updates,
-        cpu_s: cpu_s() - cpu,
+        cpu_s: cpu_seconds() - cpu,
         wall_s: wall.elapsed().as_secs_f64(),
         flops: matmul::flops() - flops,
         parameters: model.layout().len(),

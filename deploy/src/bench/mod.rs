@@ -23,6 +23,7 @@ use rit_env::{
     rollout::{Job, Rollout},
 };
 use rit_episode::{Choice, Episode, RunSeed, Stream};
+use rit_learner::checkpoint::Which;
 use rustix::time::{ClockId, clock_gettime};
 use serde_json::{Map, Value};
 use std::{process::ExitCode, sync::Arc, time::Duration};
@@ -122,7 +123,7 @@ impl Measured {
                 "`rit bench {kind}` has no use for a run's weights; --run is for learner and rollout"
             )));
         }
-        let Trained { config, model, params } = Trained::load(run)?;
+        let Trained { config, model, params } = Trained::load(run, Which::Latest)?;
         Ok(Self { config, model, params })
     }
 }
@@ -151,18 +152,9 @@ fn table(rows: &[Value]) -> String {
 /// What a benchmark prints, in this order.
 type Report = Map<String, Value>;
 
-/// CPU seconds of this process so far, user and system.
-fn cpu_s() -> f64 {
-    seconds(ClockId::ProcessCPUTime)
-}
-
 /// CPU seconds of this thread so far, user and system.
 fn thread_cpu_s() -> f64 {
-    seconds(ClockId::ThreadCPUTime)
-}
-
-fn seconds(clock: ClockId) -> f64 {
-    let time = clock_gettime(clock);
+    let time = clock_gettime(ClockId::ThreadCPUTime);
     time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
 }
 

@@ -1,6 +1,6 @@
 //! Rolling episodes as an actor does: environments, acting networks, recording. No transport.
 
-use super::{Measured, Report, cpu_s};
+use super::{Measured, Report};
 use crate::failure::Failure;
 use rit_algo::Acting;
 use rit_config::Config;
@@ -9,6 +9,7 @@ use rit_env::{
     rollout::{Job, Rollout},
 };
 use rit_nn::matmul;
+use rit_record::cpu_seconds;
 use std::time::{Duration, Instant};
 
 /// What rolling costs.
@@ -53,10 +54,10 @@ pub(super) fn measure(
         rollout.roll(acting, &jobs).iter().flatten().map(|episode| episode.steps() as u64).sum()
     };
     roll(&mut acting);
-    let (cpu, wall, flops) = (cpu_s(), Instant::now(), matmul::flops());
+    let (cpu, wall, flops) = (cpu_seconds(), Instant::now(), matmul::flops());
     let mut env_steps = 0;
     while wall.elapsed() < duration {
         env_steps += roll(&mut acting);
     }
-    Cost { env_steps, cpu_s: cpu_s() - cpu, flops: matmul::flops() - flops }
+    Cost { env_steps, cpu_s: cpu_seconds() - cpu, flops: matmul::flops() - flops }
 }

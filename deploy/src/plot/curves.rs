@@ -141,10 +141,12 @@ mod tests {
         let line = |(env_steps, value): &(u64, f64)| {
             let results = tasks.iter().enumerate().map(|(at, task)| {
                 let value = value + 10.0 * at as f64;
-                format!("\"{task}\":{{\"mean_return\":{value},\"win_rate\":null}}")
+                format!("\"{task}\":{{\"episodes\":2,\"mean_return\":{value},\"win_rate\":null}}")
             });
             let results = results.collect::<Vec<_>>().join(",");
-            format!("{{\"kind\":\"evaluation\",\"env_steps\":{env_steps},\"tasks\":{{{results}}}}}\n")
+            format!(
+                "{{\"kind\":\"evaluation\",\"env_steps\":{env_steps},\"episodes\":1,\"updates\":1,\"tasks\":{{{results}}}}}\n"
+            )
         };
         points.iter().map(line).collect()
     }
@@ -284,7 +286,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let text = lines(&[(0, 1.0), (10, 2.0)], &["x"]);
         let torn = file(folder.path(), "torn.jsonl", &format!("{}{{\"kind\":\"eval\n{}", &text, &text[..30]));
-        assert_eq!((torn.torn_lines, torn.evaluations["x"].len()), (2, 2));
+        assert_eq!((torn.broken_lines, torn.evaluations["x"].len()), (1, 2), "a torn last line is the end");
         let path = folder.path().join("torn.jsonl");
         assert!(message(read(&path, PlotMetric::WinRate)).ends_with("there is no win rate to draw"));
         fs::write(&path, "").unwrap();

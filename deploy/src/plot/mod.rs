@@ -22,9 +22,10 @@ pub fn run(options: &PlotOptions) -> Result<ExitCode, Failure> {
     let mut runs = Vec::new();
     for path in &options.runs {
         let run = runs::read(path, options.metric)?;
-        if run.torn_lines > 0 {
+        if run.broken_lines > 0 {
             // It is drawn without them, whether or not anybody is told.
-            let _ = output::say(&format!("{}: {} torn lines are left out", run.name, run.torn_lines));
+            let lines = run.broken_lines;
+            let _ = output::say(&format!("{}: {lines} lines cannot be read and are left out", run.name));
         }
         runs.push(run);
     }

@@ -1,11 +1,14 @@
 //! A run that something is done to, again and again.
 
-use super::schedule::{Blow, Planned};
+use super::{
+    schedule::{Blow, Planned},
+    summary,
+};
 use crate::{child, control, failure::Failure, last_words::last_words};
-use rit_config::{RunDir, TEXT_BYTES_MAX, read_regular};
+use rit_config::RunDir;
 use rit_proto::v1::{ActorStatus, CheckpointRequest, PauseRequest, ResumeRequest, RunStatus, StatusRequest};
+use rit_record::Summary;
 use rustix::process::{Pid, kill_process};
-use serde_json::Value;
 use std::{
     fs::{self, File},
     io,
@@ -89,7 +92,7 @@ impl Run {
     ///
     /// # Errors
     /// When a run fails.
-    pub async fn finish(mut self) -> Result<Vec<Value>, Failure> {
+    pub async fn finish(mut self) -> Result<Vec<Summary>, Failure> {
         let mut summaries = Vec::new();
         summaries.push(self.end().await?);
         for mut copy in std::mem::take(&mut self.copies) {
@@ -98,13 +101,12 @@ impl Run {
         Ok(summaries)
     }
 
-    async fn end(&mut self) -> Result<Value, Failure> {
+    async fn end(&mut self) -> Result<Summary, Failure> {
         let status = self.train.wait().await.map_err(Failure::runtime)?;
         if !status.success() {
             return Err(self.failed());
         }
-        let text = read_regular(&self.root.join("summary.json"), TEXT_BYTES_MAX).map_err(Failure::runtime)?;
-        serde_json::from_slice(&text).map_err(Failure::runtime)
+        summary(&RunDir::open(&self.root)?.0)
     }
 
     /// Does what is planned.

@@ -7,12 +7,12 @@ mod simulated;
 
 use crate::{cli::SoakOptions, experiments, failure::Failure, output};
 use fire::{Dealt, Run};
-use rit_config::{RunDir, TEXT_BYTES_MAX, read_regular};
+use rit_config::RunDir;
 use rit_episode::{Episode, wire::Expected};
 use rit_learner::replay_log;
+use rit_record::Summary;
 use schedule::Blow;
 use serde::Serialize;
-use serde_json::Value;
 use std::{collections::BTreeMap, fs, path::Path, process::ExitCode};
 
 /// What a soak came to.
@@ -103,16 +103,18 @@ fn compare(
     folder: &Path,
     kills: &[Dealt],
     ledger_checks: u64,
-    expected: &Value,
-    ended: &[Value],
+    expected: &Summary,
+    ended: &[Summary],
 ) -> Result<Report, Failure> {
     let (undisturbed, disturbed) = (replay(&folder.join("undisturbed"))?, replay(&folder.join("disturbed"))?);
-    let count = |summary: &Value| summary["episodes"].as_u64().unwrap_or_default();
-    let digest = |summary: &Value| summary["weights_digest"].as_str().unwrap_or_default().to_owned();
+    let count = |summary: &Summary| summary.progress.episodes;
+    let digest = |summary: &Summary| summary.weights_digest.clone().unwrap_or_default();
     let found = &ended[0];
-    let same_summary = ["weights_digest", "env_steps", "episodes", "updates", "evaluation"]
-        .iter()
-        .all(|&key| ended.iter().all(|summary| expected[key] == summary[key]));
+    // All that does not depend on time.
+    fn facts(it: &Summary) -> impl PartialEq + '_ {
+        (&it.weights_digest, it.progress, &it.evaluation, &it.testing, &it.best)
+    }
+    let same_summary = ended.iter().all(|summary| facts(summary) == facts(expected));
     let mut by_blow: BTreeMap<Blow, Times> = BTreeMap::new();
     for Dealt { blow, recovery_s } in kills {
         let times = by_blow.entry(*blow).or_default();
@@ -139,12 +141,17 @@ fn compare(
 /// The episodes that replay held at the end, each checked as on its way in.
 fn replay(root: &Path) -> Result<Vec<Episode>, Failure> {
     let (run_dir, config) = RunDir::open(root)?;
-    let summary = read_regular(&run_dir.summary(), TEXT_BYTES_MAX).map_err(Failure::runtime)?;
-    let summary: Value = serde_json::from_slice(&summary).map_err(Failure::runtime)?;
-    let end = summary["episodes"].as_u64().unwrap_or_default();
+    let end = summary(&run_dir)?.progress.episodes;
     let numbers = end.saturating_sub(config.algorithm.buffer_size as u64)..end;
     let expected = Expected { run_id: run_dir.lineage(), ..rit_learner::expected(&run_dir, &config) };
     replay_log::read(&run_dir.replay(), &expected, numbers).map_err(Failure::runtime)
+}
+
+/// What a run that has ended came to.
+fn summary(run_dir: &RunDir) -> Result<Summary, Failure> {
+    let summary = Summary::read(run_dir).map_err(Failure::runtime)?;
+    let missing = || Failure::runtime_message(format!("{} is missing", run_dir.summary().display()));
+    summary.ok_or_else(missing)
 }
 
 fn table(report: &Report) -> String {

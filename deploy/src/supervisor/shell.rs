@@ -5,11 +5,12 @@ use crate::{
     control, logging::LogOptions, progress::Progress, report::printable, shutdown, warnings::Warnings,
 };
 use rit_config::{OwnedRunDir, RunDir};
-use rit_learner::{life, summary::Summary};
+use rit_learner::life;
 use rit_proto::{
     transport::Client,
     v1::{RunState, RunStatus, StatusRequest, StopRequest, control_client::ControlClient},
 };
+use rit_record::Summary;
 use std::{collections::VecDeque, fs, io::ErrorKind, pin::Pin, time::Duration};
 use tokio::time::Instant;
 
@@ -29,12 +30,14 @@ enum Contacted {
 type Contact<'a> = Pin<Box<dyn Future<Output = Contacted> + 'a>>;
 
 /// Starts the processes of a run with so many actors, and watches over them until all have ended for good. The second
-/// value says whether the run has begun: a learner has answered.
+/// value says whether the run has begun: a learner has answered. Where it is `supervised`, the end of standard input asks
+/// it to end.
 pub async fn watch_over(
     owned: &OwnedRunDir,
     log_options: &LogOptions,
     progress: &mut Progress,
     actors: u32,
+    supervised: bool,
 ) -> (Outcome, bool) {
     let run_dir = owned.run_dir();
     let mut shell = Shell {
@@ -49,7 +52,7 @@ pub async fn watch_over(
         web_url: None,
         is_gone: false,
     };
-    let interrupted = shutdown::requested(false);
+    let interrupted = shutdown::requested(supervised);
     tokio::pin!(interrupted);
     let mut was_interrupted = false;
     let mut event = Event::Begin;

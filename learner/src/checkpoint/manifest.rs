@@ -1,28 +1,13 @@
 //! `checkpoint.json`, and what it has to say for training to go on from it.
 
 use super::Origin;
-use crate::{
-    evaluation::{Exploring, TaskResult},
-    ledger::Terms,
-    metrics::RECENT,
-    tensorboard::Position,
-};
+use crate::{ledger::Terms, metrics::RECENT, tensorboard::Position};
 use rit_config::Algorithm;
+use rit_record::{Best, Exploring, Progress, TaskResult};
 use serde::{Deserialize, Serialize};
 
 /// Beyond what anybody trains: sums of so many steps do not overflow.
 const ENV_STEPS_LIMIT: u64 = 1 << 53;
-
-/// How far training has come.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Progress {
-    /// Environment steps collected.
-    pub env_steps: u64,
-    /// Episodes collected.
-    pub episodes: u64,
-    /// Updates made.
-    pub updates: u64,
-}
 
 /// The small part of a checkpoint, as it stands in `checkpoint.json`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -54,8 +39,14 @@ pub struct Manifest {
     pub tensorboard: Position,
     /// Seconds the learner has run.
     pub wall_s: f64,
-    /// The newest scheduled evaluation: task by task.
+    /// Seconds of processor time that the run's processes have taken.
+    #[serde(default)]
+    pub cpu_s: f64,
+    /// The newest scheduled evaluation: task by task, means alone.
     pub evaluation: Option<(Progress, Vec<(String, TaskResult)>)>,
+    /// The best policy so far, where it is kept.
+    #[serde(default)]
+    pub best: Option<Best>,
     /// Digest of the weights.
     pub weights_digest: String,
 }

@@ -1,14 +1,14 @@
 //! Which checkpoint training goes on from.
 
 use super::{
-    CheckpointError, MANIFEST, Manifest, Origin, OtherOrigin, TrainingState, folders, load, load_manifest,
-    written,
+    BEST, CheckpointError, MANIFEST, Manifest, Origin, OtherOrigin, TrainingState, folders, load,
+    load_manifest, written,
 };
 use crate::replay_log;
 use rit_algo::Learner;
 use rit_config::{Config, RunDir};
 use rit_episode::{Episode, wire::Expected};
-use rit_policy::place::LATEST;
+use rit_policy::place::{LATEST, WEIGHTS};
 use std::path::{Path, PathBuf};
 
 /// A checkpoint that training goes on from.
@@ -78,25 +78,57 @@ pub fn load_newest(
     }
 }
 
-/// The folder of the newest checkpoint, for whoever wants its weights alone; `None` for a run that has never written one.
+/// Which of a run's weights are wanted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Which {
+    /// Those of the newest checkpoint.
+    #[default]
+    Latest,
+    /// The best that it keeps.
+    Best,
+    /// Those of the checkpoint at so many environment steps.
+    Step(u64),
+}
+
+/// The file of the weights, for whoever wants them alone; `None` for a run that has never written a checkpoint.
 ///
 /// # Errors
-/// When there was one and it is gone, when it is of another run or build, or cannot be read.
-pub fn latest(run_dir: &RunDir, config: &Config) -> Result<Option<PathBuf>, CheckpointError> {
+/// When there was one and it is gone, when it is of another run or build, or when these weights are not kept.
+pub fn weights(run_dir: &RunDir, config: &Config, which: Which) -> Result<Option<PathBuf>, CheckpointError> {
     let all = run_dir.checkpoints();
-    let folder = all.join(LATEST);
+    let folder = match which {
+        Which::Step(env_steps) => at_step(&all, env_steps)?,
+        Which::Latest | Which::Best => all.join(LATEST),
+    };
     if !folder.join(MANIFEST).exists() {
         return match written::newest(run_dir) {
             Some(newest) => Err(CheckpointError::Gone { folder: all, newest }),
             None => Ok(None),
         };
     }
-    let origin = load_manifest(&folder)?.origin;
-    match Origin::of(run_dir, config)?.may_go_on_from(&origin) {
+    let manifest = load_manifest(&folder)?;
+    match Origin::of(run_dir, config)?.may_go_on_from(&manifest.origin) {
         // Settings that another training would follow from do not change what these weights do.
-        Ok(_) | Err(OtherOrigin::Setting { .. }) => Ok(Some(folder)),
-        Err(what) => Err(CheckpointError::Other { folder, what }),
+        Ok(_) | Err(OtherOrigin::Setting { .. }) => {}
+        Err(what) => return Err(CheckpointError::Other { folder, what }),
     }
+    match (which, manifest.best) {
+        (Which::Best, None) => Err(CheckpointError::NoBest { folder }),
+        (Which::Best, Some(_)) => Ok(Some(folder.join(BEST))),
+        _ => Ok(Some(folder.join(WEIGHTS))),
+    }
+}
+
+/// The newest folder at this step.
+fn at_step(all: &Path, env_steps: u64) -> Result<PathBuf, CheckpointError> {
+    let folders = folders::list(all)?;
+    let found = folders.iter().rfind(|folder| folder.env_steps == env_steps);
+    found.map(|folder| folder.path.clone()).ok_or_else(|| {
+        let mut there: Vec<String> =
+            folders.iter().map(|folder| format!("step-{}", folder.env_steps)).collect();
+        there.dedup();
+        CheckpointError::NoStep { folder: all.to_owned(), env_steps, there }
+    })
 }
 
 /// The settings that have changed since, in words.

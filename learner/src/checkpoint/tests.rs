@@ -1,10 +1,11 @@
 use super::*;
-use crate::{evaluation::Exploring, ledger::Terms, tensorboard::Position};
+use crate::{ledger::Terms, tensorboard::Position};
 use rit_config::{Config, OwnedRunDir};
 use rit_episode::{
     RunSeed, Stream,
     wire::{Expected, PayloadLayout, TaskSize},
 };
+use rit_record::{Best, Exploring, Progress};
 use std::{
     collections::BTreeSet,
     sync::{
@@ -49,7 +50,15 @@ impl Run {
                 };
                 NamedState { name, numbers }
             });
+        let best = Best {
+            measure: "mean_return".into(),
+            value: 0.1 + 0.2,
+            progress: Progress { env_steps: 2, episodes: 2, updates: 1 },
+            weights_digest: weights_file::digest(&numbers(params.len(), 9)),
+            ..Best::default()
+        };
         TrainingState {
+            best: Some(numbers(params.len(), 9)),
             learner: learner.collect(),
             snapshots: vec![Snapshot::new(4, 90, &acting), Snapshot::new(5, 100, &acting)],
             manifest: Manifest {
@@ -66,7 +75,9 @@ impl Run {
                 metrics_len: 77,
                 tensorboard: Position { file: "events".into(), len: 55 },
                 wall_s: 1.5,
+                cpu_s: 2.5,
                 evaluation: None,
+                best: Some(best),
                 weights_digest: weights_file::digest(&params),
             },
             params,
@@ -133,7 +144,7 @@ fn only_the_last_few_are_kept() {
 
 #[test]
 fn a_damaged_newest_is_reported_and_the_one_before_is_used() {
-    for name in [WEIGHTS, STATE, MANIFEST, SUMS] {
+    for name in [WEIGHTS, BEST, STATE, MANIFEST, SUMS] {
         let run = run();
         run.save(10);
         let newest = run.save(20);
@@ -382,10 +393,17 @@ fn wherever_writing_was_cut_short_the_next_learner_goes_on() {
 #[test]
 fn whoever_wants_the_weights_alone_is_told_whose_they_are() {
     let (run, other) = (run(), run());
-    let latest = |run: &Run| latest(&run.run_dir, &run.config);
+    let of = |run: &Run, which| weights(&run.run_dir, &run.config, which);
+    let latest = |run: &Run| of(run, Which::Latest);
     assert!(latest(&run).unwrap().is_none(), "none was ever written");
     let folder = run.save(20);
-    assert_eq!(fs::canonicalize(latest(&run).unwrap().unwrap()).unwrap(), folder);
+    assert_eq!(fs::canonicalize(latest(&run).unwrap().unwrap()).unwrap(), folder.join(WEIGHTS));
+    let best = of(&run, Which::Best).unwrap().unwrap();
+    let best = weights_file::load(&best, run.learner.model().layout()).unwrap();
+    assert_eq!(Some(best), run.state(20).best);
+    assert_eq!(of(&run, Which::Step(20)).unwrap(), Some(folder.join(WEIGHTS)));
+    let elsewhere = of(&run, Which::Step(30)).unwrap_err().to_string();
+    assert!(elsewhere.ends_with("holds no checkpoint at 30 steps; there are: step-20"), "{elsewhere}");
     let mut edited = run;
     edited.config.algorithm.gamma = 0.5;
     assert!(latest(&edited).unwrap().is_some(), "weights do what they do");
@@ -399,4 +417,15 @@ fn whoever_wants_the_weights_alone_is_told_whose_they_are() {
             .to_string()
             .contains("holds no checkpoint, and this run has written some")
     );
+}
+
+#[test]
+fn a_checkpoint_without_a_best_policy_says_so() {
+    let run = run();
+    let mut state = run.state(20);
+    (state.best, state.manifest.best) = (None, None);
+    save(&run.run_dir, run.learner.model(), &TaskNames::of(&run.config), &state, 3).unwrap();
+    assert_eq!(run.load().unwrap().unwrap().state, state);
+    let none = weights(&run.run_dir, &run.config, Which::Best).unwrap_err().to_string();
+    assert!(none.contains("keeps no best policy: checkpoints.keep_best was not set"), "{none}");
 }

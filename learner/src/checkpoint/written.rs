@@ -2,11 +2,9 @@
 //! that a run whose checkpoints are gone is no new run.
 
 use super::{CheckpointError, LATEST, io, write_whole};
-use crate::{
-    checkpoint::origin::Origin,
-    summary::{Ended, Summary},
-};
+use crate::checkpoint::origin::Origin;
 use rit_config::{RunDir, TEXT_BYTES_MAX, read_regular};
+use rit_record::{Ended, Summary};
 use serde::{Deserialize, Serialize};
 use std::{fs, path::PathBuf};
 

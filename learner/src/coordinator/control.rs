@@ -1,8 +1,8 @@
 //! What people want of a run: pause, resume, stop, other settings.
 
 use super::{Coordinator, Effect, State};
-use crate::summary::Ended;
 use rit_config::Config;
+use rit_record::Ended;
 use std::sync::Arc;
 
 impl Coordinator {

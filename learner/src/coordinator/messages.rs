@@ -4,12 +4,12 @@ use super::losses::Loss;
 use crate::{
     ledger::{ActorId, Terms},
     receive::Fence,
-    summary::Ended,
     trainer::News,
     writer::CheckpointEnded,
 };
 use rit_config::Config;
 use rit_episode::Episode;
+use rit_record::Ended;
 use std::sync::Arc;
 
 /// What happens.

@@ -4,13 +4,13 @@ use super::{Coordinator, Effect, Input, Joining, LOOK_EVERY, Loss, Refusal};
 use crate::{
     ledger::{ActorId, Terms},
     receive::Fence,
-    summary::Ended,
     trainer::{Checkpointed, News, Work},
     writer::CheckpointEnded,
 };
 use rit_config::Config;
 use rit_episode::Episode;
 use rit_proto::v1::{self, LearnerMessage, learner_message::Message};
+use rit_record::Ended;
 use std::{
     collections::{BTreeMap, VecDeque},
     sync::{Arc, mpsc},

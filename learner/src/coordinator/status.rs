@@ -3,20 +3,21 @@
 
 use super::{Actor, Coordinator, State};
 use crate::{
-    evaluation::TaskResult,
     gauges::{Checkpoints, Happening, Rates},
     ledger::{ActorId, Counts},
+    messages,
     trainer::Standing,
 };
 use rit_episode::wire::{Header, PayloadLayout};
 use rit_proto::v1;
+use rit_record::TaskResult;
 use std::time::Duration;
 
 impl Coordinator {
     /// How the run stands, at this moment since the learner's beginning.
     pub fn status(&self, now: Duration) -> v1::RunStatus {
         let Standing { progress, measured, recent, evaluation, replay_episodes } = &self.standing;
-        let messages = |results: &[TaskResult]| results.iter().map(TaskResult::to_message).collect();
+        let messages = |results: &[TaskResult]| results.iter().map(messages::task_result).collect();
         // All frames of a run have the same length.
         let frame_bytes = size_of::<Header>() + PayloadLayout::new(self.config.dims()).len();
         v1::RunStatus {
@@ -44,7 +45,7 @@ impl Coordinator {
             checkpoints: Some(self.checkpoints.into()),
             happenings: self.happenings.list().iter().map(v1::Happening::from).collect(),
             actors_wanted: self.config.actors.count as u32,
-            measures: measured.to_messages(self.measures),
+            measures: messages::measures(measured, self.measures),
             algorithm: self.config.algorithm.name.to_string(),
         }
     }

@@ -1,13 +1,11 @@
 //! How training ends: the last checkpoint, the last evaluation and the summary, insisted on while a disk is full.
 
 use super::{News, TrainError, Trainer, Work};
-use crate::{
-    evaluation::by_task,
-    replay_log::remedy,
-    summary::{Ended, SUMMARY_FORMAT, Summary},
-};
+use crate::replay_log::remedy;
 use rit_config::{Config, write_whole};
+use rit_env::Split;
 use rit_policy::{TaskNames, weights_file};
+use rit_record::{Best, Ended, Evaluation, Host, Line, Occasion, Summary, TaskResult};
 use std::{
     collections::BTreeMap,
     fs,
@@ -30,7 +28,8 @@ impl Trainer {
     ) -> Result<Summary, TrainError> {
         let (done, written) = oneshot::channel();
         self.checkpoint(Some(done));
-        let evaluation = by_task(&self.greedy(self.config.evaluation.episodes)?);
+        let [evaluation, testing] = self.last_evaluation()?;
+        let best = self.absolute_metric()?;
         let mut first = Some(written);
         let checkpointed = self.insist("the last checkpoint", work, |trainer| {
             let written = first.take().unwrap_or_else(|| {
@@ -44,10 +43,11 @@ impl Trainer {
         if let Err(error) = checkpointed {
             return Err(TrainError::Checkpoint(self.rescue(error)));
         }
-        let mut summary = Summary { evaluation, ..self.summary(ended) };
+        let mut summary = Summary { evaluation, testing, best, ..self.summary(ended) };
         self.insist("summary.json", work, |trainer| {
             summary.warnings.clone_from(&trainer.warnings);
-            summary.write(&trainer.run_dir).map_err(|error| format!("{error}{}", remedy(&error)))
+            let written = trainer.metrics.flush().and_then(|()| summary.write(&trainer.run_dir));
+            written.map_err(|error| format!("{error}{}", remedy(&error)))
         })
         .map_err(TrainError::Summary)?;
         Ok(summary)
@@ -55,15 +55,62 @@ impl Trainer {
 
     pub(super) fn summary(&self, ended: Ended) -> Summary {
         Summary {
-            format_version: SUMMARY_FORMAT,
             ended,
             reason: None,
             progress: self.standing.progress,
             wall_s: self.metrics.wall_s(),
+            cpu_s: Some(self.cpu_s()),
+            build: Some(self.made.build.clone()),
+            host: Some(Host::this()),
             weights_digest: Some(weights_file::digest(self.learner.params())),
-            evaluation: BTreeMap::new(),
             warnings: self.warnings.clone(),
+            ..Summary::default()
         }
+    }
+
+    /// The last weights on the training tasks, and on the testing tasks if those are evaluated at all: means. Its lines lie
+    /// behind the last checkpoint, so a run that is gone on with forgets them.
+    fn last_evaluation(&mut self) -> Result<[BTreeMap<String, TaskResult>; 2], TrainError> {
+        let progress = self.standing.progress;
+        let episodes = self.config.evaluation.episodes as u64;
+        let same = |(at, results): &(_, Vec<TaskResult>)| {
+            *at == progress && results.iter().all(|result| result.episodes == episodes)
+        };
+        let training = match self.evaluated.take().filter(same) {
+            Some((_, results)) => results,
+            None => self.greedy(Split::Training)?,
+        };
+        let has_testing = self.config.evaluation.testing_every_env_steps > 0;
+        let testing = if has_testing { self.greedy(Split::Testing)? } else { Vec::new() };
+        for (split, results) in [(Split::Training, &training), (Split::Testing, &testing)] {
+            if !results.is_empty() {
+                self.record_evaluation(Occasion::Final, split, results)?;
+            }
+        }
+        Ok([by_task(&training), by_task(&testing)])
+    }
+
+    /// The best policy, where it is kept; if that is asked for with the absolute metric: ten times as many episodes of all
+    /// tasks, and others than those that it was chosen by, which it may have had luck with.
+    fn absolute_metric(&mut self) -> Result<Option<Best>, TrainError> {
+        let Some((best, params)) = self.best.clone() else { return Ok(None) };
+        let evaluation = self.config.evaluation.clone();
+        if !evaluation.absolute_metric {
+            return Ok(Some(best));
+        }
+        let (acting, seed) = (self.learner.model().acting(), self.config.seed.derive("absolute metric", 0));
+        let mut of_split = |split: Split, episodes: usize| {
+            let results = self.roll(&params[acting.clone()], split, Some(10 * episodes), seed)?;
+            if !results.is_empty() {
+                let (progress, wall_s) = (best.progress, self.metrics.wall_s());
+                let evaluation = Evaluation::new(progress, wall_s, Occasion::Best, split, &results);
+                self.measured(&Line::Evaluation(evaluation))?;
+            }
+            Ok::<_, TrainError>(by_task(&results))
+        };
+        let training = of_split(Split::Training, evaluation.episodes)?;
+        let testing = of_split(Split::Testing, evaluation.testing_episodes)?;
+        Ok(Some(Best { evaluation: training, testing, ..best }))
     }
 
     /// Tries until it is done, for as long as `checkpoints.last_retry_ms` says: a disk that is full now may not be later.
@@ -133,4 +180,9 @@ impl Trainer {
             Err(rescue) => format!("{error}; nor are the last weights in {}: {rescue}", path.display()),
         }
     }
+}
+
+/// Means by task, as summaries have them.
+fn by_task(results: &[TaskResult]) -> BTreeMap<String, TaskResult> {
+    results.iter().map(|result| (result.task.clone(), result.means())).collect()
 }

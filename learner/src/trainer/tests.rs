@@ -41,7 +41,8 @@ fn an_update_that_is_not_finite_ends_the_run_before_it_reaches_anything() {
         let learner = rit_algo::learner(model, config.update(), params.clone()).unwrap();
         let (writer, written) = write_queue(config.replay_episodes().max(100));
         let (trainer, board) =
-            Trainer::new(config.clone(), run_dir, learner, None, Box::new(|_| ()), writer).unwrap();
+            Trainer::new(config.clone(), run_dir, learner, None, Box::new(|_| ()), writer, Made::default())
+                .unwrap();
         let (work, queue) = mpsc::channel();
         batches(&config, 3).into_iter().for_each(|batch| work.send(batch).unwrap());
         let ended = trainer.run(&queue);

@@ -5,7 +5,6 @@ use crate::{
     coordinator::Control,
     prometheus,
     run_handle::{AskError, Watched},
-    summary::Ended,
 };
 use axum::{
     Json, Router,
@@ -19,6 +18,7 @@ use rit_config::{open_regular, read_text};
 use rit_env::{BodyKind, LinkKind, Scene, SceneLink, Split, Task};
 use rit_episode::Action;
 use rit_proto::{transport::AllTaken, v1};
+use rit_record::Ended;
 use serde::{Deserialize, Serialize};
 use std::{
     fs::{self, OpenOptions},

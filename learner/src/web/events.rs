@@ -8,6 +8,7 @@ use axum::{
     http::HeaderMap,
     response::sse::{Event, KeepAlive, Sse},
 };
+use rit_record::Line;
 use serde::Deserialize;
 use std::{convert::Infallible, time::Duration};
 use tokio::sync::mpsc;
@@ -94,11 +95,16 @@ async fn feed(
                 break;
             }
             let id = format!("{}-{}", page.learner, metrics.at());
-            if let Ok(event) = Event::default().event("metrics").id(id).json_data(lines) {
+            if let Ok(event) = Event::default().event("metrics").id(id).json_data(shown(lines)) {
                 send(event).await?;
             }
         }
     }
+}
+
+/// What a page draws of lines: the means of evaluations, not each of their episodes.
+fn shown(lines: Vec<Line>) -> Vec<Line> {
+    lines.into_iter().map(Line::means).collect()
 }
 
 /// An event that says all by its name. Browsers pass one without data over.

@@ -9,16 +9,16 @@ use rit_episode::{
     wire::{Expected, Header, PayloadLayout},
 };
 use rit_learner::{
-    checkpoint::{self, Manifest, Origin, Progress, SnapshotMark, TrainingState},
-    evaluation::Exploring,
+    checkpoint::{self, Manifest, Origin, SnapshotMark, TrainingState},
     ledger::{Ledger, Terms},
     replay_log::ReplayLog,
     tensorboard::Position,
-    trainer::{TrainError, Trainer, Work},
+    trainer::{Made, TrainError, Trainer, Work},
     weights::Snapshot,
     write_queue::write_queue,
 };
 use rit_policy::{TaskNames, place::LATEST, weights_file};
+use rit_record::{Exploring, Progress};
 use serde_json::Value;
 use sha2::{Digest as _, Sha256};
 use std::{
@@ -135,7 +135,8 @@ impl Run {
         let Ok(loaded) = loaded else { return false };
         let (to_write, _) = write_queue(0);
         let run_dir = self.run_dir.clone();
-        let trainer = Trainer::new(self.config.clone(), run_dir, learner, loaded, Box::new(|_| ()), to_write);
+        let (config, made) = (self.config.clone(), Made::default());
+        let trainer = Trainer::new(config, run_dir, learner, loaded, Box::new(|_| ()), to_write, made);
         let Ok((trainer, board)) = trainer else { panic!("the trainer does not start") };
 
         let beginning = trainer.beginning();
@@ -224,6 +225,7 @@ fn state(learner: &dyn Learner, config: &Config, origin: Origin) -> TrainingStat
     let acting = &params[learner.model().acting()];
     let lag = config.algorithm.policy_lag as u64;
     TrainingState {
+        best: None,
         learner: learner.state().into_iter().map(NamedState::into_owned).collect(),
         snapshots: (UPDATES - lag..=UPDATES)
             .map(|version| Snapshot::new(version, 2 * version, acting))
@@ -244,6 +246,8 @@ fn state(learner: &dyn Learner, config: &Config, origin: Origin) -> TrainingStat
             metrics_len: 100,
             tensorboard: Position::default(),
             wall_s: 1.5,
+            cpu_s: 2.5,
+            best: None,
             evaluation: None,
             weights_digest: weights_file::digest(&params),
         },

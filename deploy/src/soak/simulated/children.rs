@@ -6,8 +6,9 @@ use super::{
 };
 use crate::supervisor::{Effect, Event, Exit, Hung, Place, Standing};
 use rand::RngExt as _;
-use rit_learner::{coordinator::Input, summary::Ended};
+use rit_learner::coordinator::Input;
 use rit_proto::v1::RunState;
+use rit_record::Ended;
 use std::{
     collections::{BTreeSet, VecDeque},
     time::Duration,

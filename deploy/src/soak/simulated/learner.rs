@@ -9,15 +9,14 @@ use crate::supervisor::Exit;
 use rit_config::Config;
 use rit_episode::{End, Episode};
 use rit_learner::{
-    checkpoint::Progress,
     coordinator::{Coordinator, Effect, Input, Joining, LOOK_EVERY, Refusal},
     ledger::{ActorId, Terms},
     receive::Fence,
-    summary::Ended,
     trainer::{Beginning, News, Standing},
     writer::CheckpointEnded,
 };
 use rit_proto::v1::RunStatus;
+use rit_record::{Ended, Progress};
 use std::{
     collections::{BTreeMap, VecDeque},
     sync::Arc,

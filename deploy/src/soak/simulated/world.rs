@@ -14,8 +14,8 @@ use rit_learner::{
     coordinator::{Input, Joining},
     ledger::ActorId,
     receive::Fence,
-    summary::Ended,
 };
+use rit_record::Ended;
 use std::{
     cmp::Ordering,
     collections::{BTreeMap, BinaryHeap, VecDeque},

@@ -1,0 +1,236 @@
+//! A sweep as jobs of a cluster: nothing is scheduled here. Each job runs one cell, by its index, and goes on with it when
+//! it is started again.
+
+use crate::failure::Failure;
+use rit_config::read_text;
+use rit_record::Sweep;
+use std::path::{Path, PathBuf};
+
+/// What a cluster is told of a sweep.
+#[derive(Debug)]
+pub struct Job {
+    /// The sweep's file.
+    file: PathBuf,
+    dir: PathBuf,
+    cells: usize,
+    /// How many run at once at most.
+    at_once: Option<usize>,
+    /// The queue of Kueue that it waits in.
+    queue: Option<String>,
+    /// Experiments that are files and no part of the program.
+    experiments: Vec<PathBuf>,
+}
+
+impl Job {
+    /// Of this sweep.
+    ///
+    /// # Errors
+    /// When its file has gone meanwhile.
+    pub fn new(
+        file: &Path,
+        dir: &Path,
+        sweep: &Sweep,
+        at_once: Option<usize>,
+        queue: Option<&str>,
+    ) -> Result<Self, Failure> {
+        let mut experiments: Vec<PathBuf> = sweep
+            .cells
+            .iter()
+            .map(|cell| PathBuf::from(&cell.experiment))
+            .filter(|path| path.extension().is_some_and(|extension| extension == "toml"))
+            .collect();
+        experiments.sort();
+        experiments.dedup();
+        Ok(Self {
+            file: file.canonicalize().map_err(Failure::runtime)?,
+            dir: dir.to_owned(),
+            cells: sweep.cells.len(),
+            at_once,
+            queue: queue.map(str::to_owned),
+            experiments,
+        })
+    }
+
+    /// The sweep's name: its file's, as names of jobs may be.
+    fn name(&self) -> String {
+        let stem = self.file.file_stem().unwrap_or_default().to_string_lossy().to_lowercase();
+        let plain: String =
+            stem.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).take(40).collect();
+        let words = plain.split('-').filter(|word| !word.is_empty()).collect::<Vec<_>>().join("-");
+        if words.is_empty() { "sweep".to_owned() } else { words }
+    }
+}
+
+/// Words of a shell, whatever they hold.
+fn quoted(path: &Path) -> String {
+    format!("'{}'", path.display().to_string().replace('\'', r"'\''"))
+}
+
+/// An array job for Slurm.
+pub fn slurm(job: &Job) -> String {
+    let Job { cells, at_once, .. } = job;
+    let at_once = at_once.map_or_else(String::new, |at_once| format!("%{at_once}"));
+    let (name, file, dir) = (job.name(), quoted(&job.file), quoted(&job.dir));
+    format!(
+        r#"#!/bin/bash
+# {cells} runs of a sweep, each by its index in the array: sbatch THIS-FILE. A job that is requeued, or started again, goes
+# on with its run from the newest checkpoint; one whose run is finished ends at once. `rit sweep status` in DIR shows how
+# all stand. The folder lies on a file system that all nodes see and that can hold a Unix socket.
+#SBATCH --job-name={name}
+#SBATCH --array=0-{last}{at_once}
+#SBATCH --requeue
+#SBATCH --cpus-per-task=4
+#SBATCH --mem=4G
+#SBATCH --time=24:00:00
+#SBATCH --signal=B:USR1@180
+#SBATCH --open-mode=append
+#SBATCH --output={name}-%A_%a.log
+set -uo pipefail
+rit=${{RIT:-rit}}
+file={file}
+dir={dir}
+
+# What shared memory is administered with needs a short path, and sites give long ones.
+export TMPDIR=/tmp
+
+"$rit" sweep "$file" --dir "$dir" --cell "$SLURM_ARRAY_TASK_ID" &
+run=$!
+# Three minutes before the job's time is over: a checkpoint, and into the queue again. A job that is cancelled or preempted
+# gets TERM and writes its checkpoint too; whether it comes back is Slurm's to decide.
+again=false
+trap 'again=true; kill -TERM "$run" 2>/dev/null' USR1
+trap 'kill -TERM "$run" 2>/dev/null' TERM INT
+
+# `wait` returns early when a trap has run: wait until the run has really ended.
+status=0
+while kill -0 "$run" 2>/dev/null; do
+    status=0
+    wait "$run" || status=$?
+done
+if [ "$status" -eq 130 ] && "$again"; then
+    exec scontrol requeue "${{SLURM_ARRAY_JOB_ID}}_${{SLURM_ARRAY_TASK_ID}}"
+fi
+exit "$status"
+"#,
+        last = cells - 1,
+    )
+}
+
+/// An Indexed Job for Kubernetes, with the sweep's file in a ConfigMap.
+///
+/// # Errors
+/// When the sweep's file cannot be read any more, or names experiments that are files.
+pub fn kubernetes(job: &Job) -> Result<String, Failure> {
+    if let Some(path) = job.experiments.first() {
+        return Err(Failure::input_message(format!(
+            "{}: a pod has the experiments that come with the program; put what this one sets under [set]",
+            path.display()
+        )));
+    }
+    let text = read_text(&job.file)
+        .map_err(|error| Failure::input_message(format!("{}: {error}", job.file.display())))?;
+    let indented: String = text
+        .lines()
+        .map(|line| if line.is_empty() { "\n".to_owned() } else { format!("    {line}\n") })
+        .collect();
+    let (name, cells) = (job.name(), job.cells);
+    let at_once = job.at_once.unwrap_or(cells);
+    let (queue, suspend) = match &job.queue {
+        Some(queue) => (format!("\n    kueue.x-k8s.io/queue-name: {queue}"), true),
+        None => (String::new(), false),
+    };
+    Ok(format!(
+        r#"# {cells} runs of a sweep, each by its pod's index: kubectl apply -f THIS-FILE. A pod that is replaced goes on with its
+# run from the newest checkpoint; one whose run is finished ends at once. With suspend: true the job waits, and pods that
+# run write their checkpoints and go: kubectl patch job rit-{name} -p '{{"spec":{{"suspend":true}}}}'. A queue of Kueue does so by
+# itself (`rit sweep … --queue NAME`).
+apiVersion: v1
+kind: ConfigMap
+metadata:
+  name: rit-{name}
+  labels: {{ app.kubernetes.io/name: rit }}
+data:
+  sweep.toml: |
+{indented}---
+apiVersion: v1
+kind: PersistentVolumeClaim
+metadata:
+  name: rit-{name}
+  labels: {{ app.kubernetes.io/name: rit }}
+spec:
+  # Pods of several nodes write, each to a folder of its own; the volume must be able to hold Unix sockets. Where all run on
+  # one node, ReadWriteOnce will do.
+  accessModes: [ReadWriteMany]
+  resources:
+    requests: {{ storage: 50Gi }}
+---
+apiVersion: batch/v1
+kind: Job
+metadata:
+  name: rit-{name}
+  labels:
+    app.kubernetes.io/name: rit{queue}
+spec:
+  suspend: {suspend}
+  completionMode: Indexed
+  completions: {cells}
+  parallelism: {at_once}
+  # A run that fails is tried again from its checkpoint, twice; the others go on whatever becomes of it.
+  backoffLimitPerIndex: 2
+  maxFailedIndexes: {cells}
+  podFailurePolicy:
+    rules:
+      # Bad input is no better a second time.
+      - action: FailIndex
+        onExitCodes: {{ containerName: run, operator: In, values: [2] }}
+      # A node that is drained is nobody's fault.
+      - action: Ignore
+        onPodConditions: [{{ type: DisruptionTarget, status: "True" }}]
+  template:
+    metadata:
+      labels: {{ app.kubernetes.io/name: rit }}
+    spec:
+      restartPolicy: Never
+      automountServiceAccountToken: false
+      # After SIGTERM a checkpoint is written.
+      terminationGracePeriodSeconds: 120
+      securityContext:
+        runAsNonRoot: true
+        runAsUser: 10001
+        runAsGroup: 10001
+        fsGroup: 10001
+        fsGroupChangePolicy: OnRootMismatch
+        seccompProfile: {{ type: RuntimeDefault }}
+      containers:
+        - name: run
+          image: rit:{version}
+          command: ["rit", "sweep", "/sweep/sweep.toml", "--dir", "/runs/{name}"]
+          # Kubernetes says the index.
+          args: ["--cell", "$(JOB_COMPLETION_INDEX)"]
+          securityContext:
+            allowPrivilegeEscalation: false
+            readOnlyRootFilesystem: true
+            capabilities: {{ drop: [ALL] }}
+          resources:
+            requests: {{ cpu: "4", memory: 2Gi }}
+            # What lies in /dev/shm and /tmp counts as memory.
+            limits: {{ memory: 4Gi }}
+          volumeMounts:
+            - {{ name: runs, mountPath: /runs }}
+            - {{ name: sweep, mountPath: /sweep, readOnly: true }}
+            - {{ name: shared-memory, mountPath: /dev/shm }}
+            - {{ name: temporary, mountPath: /tmp }}
+      volumes:
+        - name: runs
+          persistentVolumeClaim: {{ claimName: rit-{name} }}
+        - name: sweep
+          configMap: {{ name: rit-{name} }}
+        # How much: deploy/docker/Dockerfile. A container's own /dev/shm has 64 MiB.
+        - name: shared-memory
+          emptyDir: {{ medium: Memory, sizeLimit: 64Mi }}
+        - name: temporary
+          emptyDir: {{ medium: Memory, sizeLimit: 64Mi }}
+"#,
+        version = env!("CARGO_PKG_VERSION"),
+    ))
+}
