@@ -32,6 +32,9 @@ STATE_HEAD = struct.Struct("<fBB")
 #: Nobody sends more.
 BODY_MAX = 1 << 26
 
+#: Answers wait for each other, up to so many bytes.
+UNSENT_MAX = 1 << 18
+
 # From the program.
 HELLO, OPEN, RESET, STEP, CLOSE = range(5)
 # To it.
@@ -129,6 +132,8 @@ class Worker:
         self._make: Any = None
         #: Read, and not answered yet.
         self._unread = bytearray()
+        #: Answered, and not sent yet.
+        self._unsent = bytearray()
         self._opened: dict[int, Opened] = {}
 
     def run(self) -> None:
@@ -212,6 +217,8 @@ class Worker:
     def _read(self, length: int) -> bytes:
         unread = self._unread
         while len(unread) < length:
+            # Nothing is left to do, so what was done is told: the answers to a round of requests in one go.
+            self._flush()
             part = os.read(self._requests, 1 << 16)
             if not part:
                 raise Closed
@@ -221,13 +228,17 @@ class Worker:
         return taken
 
     def _write(self, kind: int, index: int, body: bytes) -> None:
-        frame = HEADER.pack(len(body), kind, index) + body
-        try:
-            written = os.write(self._answers, frame)
-            while written < len(frame):
-                written += os.write(self._answers, frame[written:])
-        except BrokenPipeError:
-            raise Closed from None
+        self._unsent += HEADER.pack(len(body), kind, index)
+        self._unsent += body
+        if len(self._unsent) > UNSENT_MAX:
+            self._flush()
+
+    def _flush(self) -> None:
+        while self._unsent:
+            try:
+                del self._unsent[: os.write(self._answers, self._unsent)]
+            except BrokenPipeError:
+                raise Closed from None
 
 
 def _load(name: str) -> Any:
