@@ -35,6 +35,12 @@ pub enum Stream {
     TargetRoleNoise = 10,
     /// The order in which an epoch's minibatches take a batch's episodes; indexed by update · epochs + epoch.
     Minibatches = 11,
+    /// Which runs a replication of the bootstrap draws; indexed by what is estimated.
+    Resampling = 12,
+    /// Where points begin on a map of them.
+    Embedding = 13,
+    /// The decision orders that utilities are averaged over; indexed by episode number.
+    CoalitionOrders = 14,
 }
 
 /// The seed of a run, or of one evaluation.
