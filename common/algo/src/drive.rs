@@ -5,6 +5,7 @@ mod acting;
 mod pairs;
 pub(crate) mod shards;
 pub mod td;
+mod values;
 
 pub use acting::ValueActing;
 pub use shards::{Sums, tree_sum, tree_sum_f64};
@@ -12,3 +13,4 @@ pub use td::{
     Head, Pass, Role, Said, SeenShard, TdLearner, TdPass, Totals, Utilities, ValueNetwork, ValueParts,
     measures,
 };
+pub use values::EpisodeValues;

@@ -22,6 +22,7 @@ pub mod on_policy;
 mod rows;
 
 pub use config::{ConfigError, ModelConfig, PpoConfig, RoleConfig, UpdateConfig};
+pub use drive::EpisodeValues;
 pub use learner::Learner;
 pub use method::{Method, Regime};
 pub use methods::{

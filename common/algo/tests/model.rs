@@ -419,31 +419,33 @@ fn acting_does_not_depend_on_company() {
     });
 }
 
-/// The same episode with its agents in another order: new row k is old row `order[k]`.
-fn reordered(episode: &Episode, order: &[usize]) -> Episode {
-    let (n, m) = (episode.n_agents, episode.n_entities);
-    let entities: Vec<usize> = order.iter().copied().chain(n..m).collect();
-    let mut other = Episode {
-        entities: vec![],
-        observable: vec![],
-        available: vec![],
-        actions: vec![],
-        ..episode.clone()
-    };
-    for time in 0..=episode.steps() {
-        for &row in &entities {
-            other.entities.extend_from_slice(&episode.entities[(time * m + row) * D..][..D]);
-        }
-        for &agent in order {
-            let row = &episode.observable[(time * n + agent) * m..][..m];
-            other.observable.extend(entities.iter().map(|&entity| row[entity]));
-            other.available.extend_from_slice(&episode.available[(time * n + agent) * A..][..A]);
-            if time < episode.steps() {
-                other.actions.push(episode.actions[time * n + agent]);
+/// Values of an episode that is over are those that acting had, and where utilities are summed, Q_total is their sum.
+#[test]
+fn values_of_an_episode_are_those_that_acting_had() {
+    each!(&CASES, |networks| {
+        let at = networks.params(3);
+        let episodes = batch(17);
+        let sums = [Method::RitVdn, Method::VdnAttn, Method::VdnInt, Method::UpdetVdn];
+        let slots: Vec<_> = episodes.iter().enumerate().collect();
+        for (episode, acted) in episodes.iter().zip(replay(&mut networks.acting(&at), &slots)) {
+            let Some(values) = networks.model.value(&at, episode, &episode.actions) else {
+                assert!([Method::Refil, Method::Roma].contains(&networks.case.0));
+                continue;
+            };
+            let n = episode.n_agents;
+            for (row, &action) in episode.actions.iter().enumerate() {
+                let (a, b) = (values.utilities[row], acted[row * A + usize::from(action)]);
+                assert!((a - b).abs() <= 1e-5 * b.abs().max(1.0), "{:?} row {row}: {a} {b}", networks.case);
             }
+            let sum_of = |step: usize| values.utilities[step * n..][..n].iter().sum::<f32>();
+            for (step, &q_total) in values.q_total.iter().enumerate() {
+                let is_sum = (q_total - sum_of(step)).abs() < 1e-4;
+                assert!(is_sum || !sums.contains(&networks.case.0), "{:?}: {q_total}", networks.case);
+            }
+            let has_tasks = networks.case.0.facts().task_representations;
+            assert_eq!(values.representations.is_empty(), !has_tasks);
         }
-    }
-    other
+    });
 }
 
 /// Where decisions are made at once, agents are alike: their order moves utilities with them, and Q_total and the loss
@@ -457,7 +459,7 @@ fn reordering_agents_reorders_utilities_and_no_more() {
         let orders: Vec<Vec<usize>> =
             episodes.iter().map(|episode| (0..episode.n_agents).rev().collect()).collect();
         let others: Vec<Episode> =
-            episodes.iter().zip(&orders).map(|(episode, order)| reordered(episode, order)).collect();
+            episodes.iter().zip(&orders).map(|(episode, order)| episode.reordered(order)).collect();
         let (batch, other) = (episodes.iter().collect::<Vec<_>>(), others.iter().collect::<Vec<_>>());
         let draws = networks.draws(&batch);
         let mut of_other = networks.draws(&batch);

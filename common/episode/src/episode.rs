@@ -56,6 +56,40 @@ impl Episode {
         self.rewards.iter().map(|&reward| f64::from(reward)).sum()
     }
 
+    /// The same episode with its agents in another decision order: row k is what row `rows[k]` was.
+    ///
+    /// # Panics
+    /// When `rows` are not all rows of agents.
+    #[must_use]
+    pub fn reordered(&self, rows: &[usize]) -> Self {
+        let (n, m, states) = (self.n_agents, self.n_entities, self.steps() + 1);
+        assert_eq!(rows.len(), n, "one place for each agent");
+        let [d, a] = [self.entities.len() / (states * m), self.available.len() / (states * n)];
+        let entities: Vec<usize> = rows.iter().copied().chain(n..m).collect();
+        let mut other = Self {
+            decision_order: rows.iter().map(|&row| self.decision_order[row]).collect(),
+            entities: Vec::with_capacity(self.entities.len()),
+            observable: Vec::with_capacity(self.observable.len()),
+            available: Vec::with_capacity(self.available.len()),
+            actions: Vec::with_capacity(self.actions.len()),
+            ..self.clone()
+        };
+        for time in 0..states {
+            for &row in &entities {
+                other.entities.extend_from_slice(&self.entities[(time * m + row) * d..][..d]);
+            }
+            for &agent in rows {
+                let row = &self.observable[(time * n + agent) * m..][..m];
+                other.observable.extend(entities.iter().map(|&entity| row[entity]));
+                other.available.extend_from_slice(&self.available[(time * n + agent) * a..][..a]);
+                if time < self.steps() {
+                    other.actions.push(self.actions[time * n + agent]);
+                }
+            }
+        }
+        other
+    }
+
     /// Bytes its own data takes.
     pub fn bytes(&self) -> usize {
         4 * (self.entities.len() + self.rewards.len() + self.shaping.len())
