@@ -21,19 +21,29 @@ pub struct Gate {
     cookie: String,
     /// What the cookie holds. It follows from the token and does not tell it, and a restarted learner knows it again.
     session: String,
+    home: Home,
+}
+
+/// What whoever is let in sees at `/`.
+#[derive(Clone, Copy, Debug)]
+pub enum Home {
+    /// This page.
+    Page(&'static str),
+    /// What lies at this path.
+    Path(&'static str),
 }
 
 impl Gate {
     /// Of this run's token.
-    pub fn new(run_dir: &RunDir) -> Self {
-        let token = run_dir.token();
+    pub(super) fn of_run(run_dir: &RunDir) -> Self {
+        Self::new(run_dir.token(), &run_dir.run_id()[..4], Home::Page(include_str!("assets/index.html")))
+    }
+
+    /// For those who know this token; the name keeps its cookie apart from those of other servers of this host.
+    pub fn new(token: &str, name: &[u8], home: Home) -> Self {
         let hex = |bytes: &[u8]| bytes.iter().map(|byte| format!("{byte:02x}")).collect::<String>();
         let session = hex(&Sha256::digest(format!("rit web session {token}")));
-        Self {
-            bearer: format!("Bearer {token}"),
-            cookie: format!("rit-{}", hex(&run_dir.run_id()[..4])),
-            session,
-        }
+        Self { bearer: format!("Bearer {token}"), cookie: format!("rit-{}", hex(name)), session, home }
     }
 
     fn lets_in(&self, headers: &HeaderMap) -> bool {
@@ -61,13 +71,16 @@ pub async fn enter(
     Query(entry): Query<Entry>,
     headers: HeaderMap,
 ) -> Response {
-    let Gate { bearer, cookie, session } = gate.as_ref();
+    let Gate { bearer, cookie, session, home } = gate.as_ref();
     match entry.token {
         Some(token) if is_secret(format!("Bearer {token}").as_bytes(), bearer.as_bytes()) => {
             let cookie = format!("{cookie}={session}; Path=/; HttpOnly; SameSite=Strict");
             ([(header::SET_COOKIE, cookie)], Redirect::to("/")).into_response()
         }
-        None if gate.lets_in(&headers) => Html(include_str!("assets/index.html")).into_response(),
+        None if gate.lets_in(&headers) => match home {
+            Home::Page(page) => Html(*page).into_response(),
+            Home::Path(path) => Redirect::to(path).into_response(),
+        },
         _ => (StatusCode::UNAUTHORIZED, Html(include_str!("assets/locked.html"))).into_response(),
     }
 }
