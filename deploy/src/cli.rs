@@ -2,7 +2,7 @@
 
 use crate::logging::LogOptions;
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use rit_config::{WHOLE_MAX, count};
+use rit_config::{WHOLE_MAX, WebListen, count};
 use rit_env::combat::{StatsVersion, world::ScriptedMedivac};
 use rit_learner::{checkpoint::Which, run_handle::EPISODES_MAX};
 use rit_proto::transport::{Address, CredentialFiles, Credentials, CredentialsError};
@@ -45,8 +45,14 @@ pub enum Command {
     Soak(SoakOptions),
     /// Measure a part beside the machine's limit
     Bench(BenchOptions),
-    /// Draw learning curves of one or several runs of an experiment
+    /// Draw learning curves of runs: a line for each method, with its interval over seeds
     Plot(PlotOptions),
+    /// Make the experimental section of a paper from finished runs: one page, figures, tables, data
+    Report(ReportOptions),
+    /// Show a folder of runs or a sweep in this machine's browser: table, curves, episodes
+    Serve(ServeOptions),
+    /// Hold a run's utilities to the Shapley values that they are said to approximate
+    Shapley(ShapleyOptions),
     /// Make an authority, and certificates for a learner and for those who call it over TCP
     Certificates(CertificatesOptions),
     /// Environments of your own
@@ -543,11 +549,11 @@ pub struct SoakOptions {
 
 #[derive(Args, Debug)]
 #[command(after_help = "\
-Runs of one experiment with other seeds are drawn together: a line for the mean of each task, a band from the lowest to \
-the highest. Runs that differ in more than the seed are refused, unless --compare asks for a line for each kind of \
-them, its mean over all tasks.")]
+Runs that differ in their seed alone are drawn together: a line for the mean of each method over seeds and tasks, with its \
+95 % interval; fewer than 5 seeds are drawn one by one. Each task set has a chart of its own. Other differences are \
+refused, unless --by names the keys.")]
 pub struct PlotOptions {
-    /// Run directories, or files like their metrics.jsonl
+    /// Run directories, folders of them, sweeps, or files like their metrics.jsonl
     #[arg(required = true)]
     pub runs: Vec<PathBuf>,
     /// File to write, ending in .svg
@@ -556,21 +562,107 @@ pub struct PlotOptions {
     /// Write over the file if it is there
     #[arg(long)]
     pub force: bool,
-    /// What is drawn
-    #[arg(long, value_enum, default_value_t = PlotMetric::MeanReturn)]
-    pub metric: PlotMetric,
-    /// Draw a line for each kind of runs, told apart by what their configurations differ in
+    /// What is drawn; without it win rates where tasks can be won, returns elsewhere
+    #[arg(long, value_enum)]
+    pub metric: Option<PlotMetric>,
+    /// A key whose values are methods of their own, such as algorithm.gamma; may be given again and again
+    #[arg(long, value_name = "KEY")]
+    pub by: Vec<String>,
+    /// Draw a chart of each task in place of their mean
     #[arg(long)]
-    pub compare: bool,
-    /// What a kind of runs is called, in the order in which they are given; for --compare
-    #[arg(long = "label", value_name = "TEXT", requires = "compare")]
-    pub labels: Vec<String>,
+    pub tasks: bool,
     /// Heading
-    #[arg(long, default_value = "Greedy evaluation of the training tasks")]
-    pub title: String,
+    #[arg(long)]
+    pub title: Option<String>,
     /// Draw a dashed line at this value, for comparison
     #[arg(long, value_name = "VALUE", allow_negative_numbers = true, value_parser = finite)]
     pub line: Option<f64>,
+}
+
+#[derive(Args, Debug)]
+#[command(after_help = "\
+OUT/index.html is one page that needs nothing else; OUT/tables/*.md, OUT/figures/*.svg and OUT/runs.csv hold the same, \
+OUT/marl-eval.json is what the marl-eval and rliable packages read. Only finished runs count; what is missing of a sweep is \
+said. Runs of one method that differ in more than the seed are refused, unless --by names the keys.")]
+pub struct ReportOptions {
+    /// Sweeps, run directories, folders of them, or of committed records
+    #[arg(required = true, value_name = "DIR")]
+    pub runs: Vec<PathBuf>,
+    /// Folder for the report: new, empty, or of an earlier report, which it replaces
+    #[arg(long, value_name = "OUT")]
+    pub out: PathBuf,
+    /// Write the report even if something else lies in that folder, beside it
+    #[arg(long)]
+    pub force: bool,
+    /// What is compared; without it win rates where tasks can be won, returns elsewhere
+    #[arg(long, value_enum)]
+    pub metric: Option<PlotMetric>,
+    /// A key whose values are methods of their own, such as algorithm.gamma; may be given again and again. A sweep's axes
+    /// are such keys
+    #[arg(long, value_name = "KEY")]
+    pub by: Vec<String>,
+    /// Two methods X,Y whose probability of improvement is said; may be given again and again. Without it the first method
+    /// against every other
+    #[arg(long = "pair", value_name = "X,Y", value_parser = pair)]
+    pub pairs: Vec<(String, String)>,
+    /// Replications of the bootstrap
+    #[arg(long, value_name = "N", default_value_t = 50_000, value_parser = within::<usize>(100, 10_000_000))]
+    pub replications: usize,
+    /// Seed of the bootstrap and of the map of task representations
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = count)]
+    pub seed: u64,
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+#[derive(Args, Debug)]
+#[command(after_help = "\
+The page is served to this machine only, to whoever knows the token in its address; `ssh -L 8080:127.0.0.1:8080 HOST` leads \
+to it from another machine. Ctrl-C ends it.")]
+pub struct ServeOptions {
+    /// Folder of runs, a sweep, or a run directory
+    #[arg(value_name = "DIR")]
+    pub folder: PathBuf,
+    /// Loopback address; with port 0 a free one
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:0", value_parser = web_listen)]
+    pub listen: WebListen,
+    /// A key whose values are methods of their own, such as algorithm.gamma; may be given again and again
+    #[arg(long, value_name = "KEY")]
+    pub by: Vec<String>,
+}
+
+#[derive(Args, Debug)]
+#[command(after_help = "\
+A coalition's value at a step is that of the joint action in which its members do what they did and all others take the \
+first action that is available to them: Q_total of it (the learned game), or the return from there on as the episode goes \
+on greedily (the environment's own game). Utilities are those of the actions taken, in the episode's decision order (M = 1) \
+or averaged over M orders (equation 10).")]
+pub struct ShapleyOptions {
+    /// Run directory
+    #[arg(long, value_name = "DIR")]
+    pub run: PathBuf,
+    /// Name of a task of at most 6 agents
+    #[arg(long, value_name = "NAME")]
+    pub task: String,
+    /// Greedy episodes
+    #[arg(long, value_name = "N", default_value_t = 8, value_parser = within::<u32>(1, 1000))]
+    pub episodes: u32,
+    /// Steps of each episode from which every coalition's continuation is rolled
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = within::<u16>(0, 1000))]
+    pub rolled_steps: u16,
+    /// Seed of the episodes and orders; without it one that follows from the run's
+    #[arg(long, value_name = "N", value_parser = count)]
+    pub seed: Option<u64>,
+    /// Figure to write, ending in .svg
+    #[arg(long, value_name = "FILE")]
+    pub out: Option<PathBuf>,
+    /// Write over the figure if it is there
+    #[arg(long)]
+    pub force: bool,
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// What of an evaluation is drawn.
@@ -642,6 +734,18 @@ impl fmt::Display for BenchKind {
             Self::Ipc => "ipc",
             Self::Scale => "scale",
         })
+    }
+}
+
+fn web_listen(text: &str) -> Result<WebListen, String> {
+    WebListen::try_from(text.to_owned())
+}
+
+/// Two names with a comma between them.
+fn pair(text: &str) -> Result<(String, String), String> {
+    match text.split_once(',').map(|(x, y)| (x.trim(), y.trim())) {
+        Some((x, y)) if !x.is_empty() && !y.is_empty() => Ok((x.to_owned(), y.to_owned())),
+        _ => Err("write two methods, such as rit,qmix-attn".to_owned()),
     }
 }
 

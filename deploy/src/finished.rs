@@ -121,8 +121,8 @@ impl Finished {
     pub fn no_page(&self) -> Failure {
         let root = self.root.display();
         Failure::runtime_message(format!(
-            "the run is over and its page with it: `rit ctl --run {root} status` shows what it came to, `rit plot {root} \
-             --out curves.svg` draws its curves"
+            "the run is over and its page with it: `rit ctl --run {root} status` shows what it came to, `rit serve {root}` \
+             its curves and episodes in a browser"
         ))
     }
 }

@@ -7,6 +7,7 @@ mod build;
 mod certificates;
 mod child;
 mod cli;
+mod comparison;
 mod control;
 mod ctl;
 mod evaluate;
@@ -24,7 +25,10 @@ mod progress;
 mod python_worlds;
 mod render;
 mod report;
+mod representations;
 mod runs;
+mod serve;
+mod shapley;
 mod shutdown;
 mod soak;
 mod starcraft;
@@ -77,6 +81,9 @@ async fn run(cli: Cli) -> Result<ExitCode, Failure> {
         Command::Soak(options) => soak::run(options).await,
         Command::Bench(options) => bench::run(&options),
         Command::Plot(options) => plot::run(&options),
+        Command::Report(options) => comparison::run(&options),
+        Command::Serve(options) => serve::run(options).await,
+        Command::Shapley(options) => shapley::run(&options),
         Command::Certificates(options) => certificates::run(&options),
         Command::Env { command: EnvCommand::Check(options) } => python_worlds::check(&options),
         Command::Runs(options) => runs::run(&options),

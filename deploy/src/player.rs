@@ -56,6 +56,11 @@ impl Trained {
         let params = weights_file::load(&weights, model.layout())?;
         Ok(Self { config, model, params })
     }
+
+    /// The policy itself.
+    pub fn policy(&self) -> Box<dyn Policy> {
+        Box::new(Acting::new(&self.model, &self.params[self.model.acting()]))
+    }
 }
 
 impl Player {
@@ -124,10 +129,10 @@ impl Player {
                 "give --run DIR, whose checkpoint plays, or a --policy {SCRIPT}NAME that needs none"
             )));
         };
-        let Trained { config, model, params } = Trained::load(run, options.checkpoint.unwrap_or_default())?;
-        let config = with_backend(config, options)?;
-        let policy = Box::new(Acting::new(&model, &params[model.acting()]));
-        let weights_digest = Some(weights_file::digest(&params));
+        let trained = Trained::load(run, options.checkpoint.unwrap_or_default())?;
+        let policy = trained.policy();
+        let weights_digest = Some(weights_file::digest(&trained.params));
+        let config = with_backend(trained.config, options)?;
         Ok(Self { name: CHECKPOINT.to_owned(), config, policy, weights_digest })
     }
 }

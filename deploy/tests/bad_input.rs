@@ -79,11 +79,14 @@ fn a_plot_is_made_of_runs_of_one_kind_and_written_over_nothing() {
     let (run, file) = (run_dir.to_str().unwrap(), out.to_str().unwrap());
     assert!(output(&["plot", run, "--out", file]).status.success());
     let drawn = fs::read_to_string(&out).unwrap();
-    assert!(drawn.contains("mean return, greedy") && drawn.contains("game-4"), "{drawn}");
+    assert!(drawn.contains("win rate, mean of 4 tasks") && drawn.contains("Multi matrix game"), "{drawn}");
     refused(&["plot", run, "--out", file], &["curves.svg is there already; --force writes over it"]);
-    assert!(output(&["plot", run, "--out", file, "--force", "--metric", "win_rate"]).status.success());
-    assert!(fs::read_to_string(&out).unwrap().contains("win rate, greedy"));
-    refused(&["plot", run, run, "--out", file, "--force"], &["are the same run, seed 1: give it once"]);
+    assert!(
+        output(&["plot", run, "--out", file, "--force", "--metric", "return", "--tasks"]).status.success()
+    );
+    let drawn = fs::read_to_string(&out).unwrap();
+    assert!(drawn.contains("game-4") && !drawn.contains("win rate"), "{drawn}");
+    refused(&["plot", run, run, "--out", file, "--force"], &["are the same run: give it once"]);
 
     let other = RunFolder::new();
     other.train(&[
@@ -97,10 +100,10 @@ fn a_plot_is_made_of_runs_of_one_kind_and_written_over_nothing() {
     ]);
     let other = other.run_dir();
     let pair = ["plot", run, other.to_str().unwrap(), "--out", file, "--force"];
-    refused(&pair, &["algorithm.gamma (0.99, 0.5)", "--compare"]);
-    assert!(output(&[&pair[..], &["--compare"]].concat()).status.success());
+    refused(&pair, &["algorithm.gamma (0.99, 0.5)", "give --by algorithm.gamma"]);
+    assert!(output(&[&pair[..], &["--by", "algorithm.gamma"]].concat()).status.success());
     let drawn = fs::read_to_string(&out).unwrap();
-    assert!(drawn.contains("gamma 0.99") && drawn.contains("gamma 0.5"), "{drawn}");
+    assert!(drawn.contains("rit gamma=0.99") && drawn.contains("rit gamma=0.5"), "{drawn}");
 }
 
 #[test]

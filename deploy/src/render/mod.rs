@@ -12,10 +12,16 @@ mod recording;
 mod svg;
 mod view;
 
-use crate::{cli::RenderOptions, failure::Failure, new_file, output, player::Player};
+use crate::{
+    cli::RenderOptions,
+    failure::Failure,
+    new_file, output,
+    player::{Player, Trained},
+};
 use recording::{Film, Recording};
-use rit_learner::evaluation::Evaluator;
-use std::{path::Path, process::ExitCode};
+use rit_episode::RunSeed;
+use rit_learner::{checkpoint::Which, evaluation::Evaluator, trainer::evaluation_seed};
+use std::{ops::Range, path::Path, process::ExitCode};
 
 /// What a file's ending asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -67,14 +73,30 @@ pub fn run(options: &RenderOptions) -> Result<ExitCode, Failure> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Rolls the episodes and keeps what can be drawn of them.
+/// One greedy episode of a run's checkpoint, step by step, as `.gif`.
+///
+/// # Errors
+/// When the run has no checkpoint, there is no such task, or nothing in it can be drawn.
+pub fn replay(run: &Path, task: &str, number: u64) -> Result<Vec<u8>, Failure> {
+    let trained = Trained::load(run, Which::default())?;
+    let (policy, seed) = (trained.policy(), evaluation_seed(&trained.config));
+    let player =
+        Player { name: "checkpoint".to_owned(), config: trained.config, policy, weights_digest: None };
+    gif::encode(&film(player, task, number..number + 1, seed)?)
+}
+
+/// Rolls the episodes that are asked for.
 fn record(options: &RenderOptions) -> Result<Film, Failure> {
-    let mut player = Player::new(&options.play)?;
-    let task = player.config.environment.task_set.task(&options.task)?;
+    let player = Player::new(&options.play)?;
     let seed = player.seed(options.seed);
-    let count = usize::from(options.episodes);
-    let mut scenes = vec![Vec::new(); count];
-    let (evaluator, numbers) = (Evaluator::new(&player.config), 0..count as u64);
+    film(player, &options.task, 0..u64::from(options.episodes), seed)
+}
+
+/// Rolls episodes of these numbers and keeps what can be drawn of them.
+fn film(mut player: Player, task: &str, numbers: Range<u64>, seed: RunSeed) -> Result<Film, Failure> {
+    let task = player.config.environment.task_set.task(task)?;
+    let mut scenes = vec![Vec::new(); (numbers.end - numbers.start) as usize];
+    let evaluator = Evaluator::new(&player.config);
     let episodes = evaluator.watch(player.policy.as_mut(), task, numbers, seed, |episode, world| {
         scenes[episode].extend(world.scene());
     })?;

@@ -1,0 +1,522 @@
+//! Charts as SVG: curves, intervals in rows, and points, several beside each other under one legend.
+
+use crate::{ReportError, measure::signed};
+use plotters::{
+    coord::{Shift, types::RangedCoordf64},
+    prelude::{
+        Cartesian2d, ChartBuilder, ChartContext, Circle, Color as _, DrawingArea, IntoDrawingArea as _,
+        IntoFont as _, LineSeries, PathElement, Polygon, RGBColor, SVGBackend, TextStyle, WHITE,
+    },
+    series::DashedLineSeries,
+    style::text_anchor::{HPos, Pos, VPos},
+};
+use std::error::Error;
+
+/// Width of a figure, in pixels.
+const WIDTH: u32 = 960;
+/// Height of one chart with curves or points.
+const CHART_HEIGHT: u32 = 330;
+/// Height of a row of intervals, and of what is above and below them.
+const ROW_HEIGHT: u32 = 24;
+const ROWS_FRAME: u32 = 84;
+/// A line of the legend.
+const LEGEND_LINE: i32 = 22;
+
+/// A colour for each method of the paper's comparison, in the order in which methods are listed; what comes after them
+/// begins again, dashed.
+const COLOURS: [RGBColor; 16] = [
+    RGBColor(204, 37, 41),
+    RGBColor(237, 125, 28),
+    RGBColor(140, 86, 40),
+    RGBColor(0, 101, 189),
+    RGBColor(86, 170, 225),
+    RGBColor(68, 60, 160),
+    RGBColor(150, 130, 215),
+    RGBColor(0, 122, 84),
+    RGBColor(110, 185, 85),
+    RGBColor(205, 90, 160),
+    RGBColor(120, 120, 120),
+    RGBColor(0, 160, 165),
+    RGBColor(165, 145, 0),
+    RGBColor(40, 40, 40),
+    RGBColor(225, 130, 130),
+    RGBColor(95, 60, 120),
+];
+const GREY: RGBColor = RGBColor(105, 105, 105);
+const FRAME: RGBColor = RGBColor(190, 190, 190);
+
+/// What a line, a row or points are called, and in which colour they are drawn.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Key {
+    /// In the legend.
+    pub label: String,
+    /// Its place among the colours.
+    pub style: usize,
+}
+
+impl Key {
+    fn colour(&self) -> RGBColor {
+        COLOURS[self.style % COLOURS.len()]
+    }
+
+    fn is_dashed(&self) -> bool {
+        self.style >= COLOURS.len()
+    }
+}
+
+/// A line, with its interval or with the runs that it is the mean of.
+#[derive(Clone, Debug)]
+pub struct Line {
+    /// Whose.
+    pub key: Key,
+    /// (x, y).
+    pub points: Vec<(f64, f64)>,
+    /// (x, lower end, upper end).
+    pub band: Vec<(f64, f64, f64)>,
+    /// Thin lines.
+    pub runs: Vec<Vec<(f64, f64)>>,
+}
+
+/// One chart of curves.
+#[derive(Clone, Debug, Default)]
+pub struct Chart {
+    /// Above it.
+    pub title: String,
+    /// Below it.
+    pub x: String,
+    /// Beside it.
+    pub y: String,
+    /// What is always shown of the vertical axis.
+    pub y_shown: Vec<f64>,
+    /// Where the vertical axis ends, if it must.
+    pub y_limits: Option<[f64; 2]>,
+    /// A dashed line across it, for comparison.
+    pub marked: Option<f64>,
+    /// What is drawn.
+    pub lines: Vec<Line>,
+}
+
+/// One interval of a chart of rows.
+#[derive(Clone, Debug)]
+pub struct Row {
+    /// Whose.
+    pub key: Key,
+    /// A thick stroke; NaN for nothing.
+    pub value: f64,
+    /// A bar.
+    pub interval: Option<(f64, f64)>,
+    /// In place of the bar.
+    pub runs: Vec<f64>,
+}
+
+/// One chart of rows.
+#[derive(Clone, Debug)]
+pub struct Rows {
+    /// Above it.
+    pub title: String,
+    /// The same methods in all charts of a figure.
+    pub rows: Vec<Row>,
+    /// A dashed vertical line.
+    pub line: Option<f64>,
+    /// What is always shown of the axis.
+    pub shown: Vec<f64>,
+}
+
+/// Points on a map.
+#[derive(Clone, Debug)]
+pub struct Points {
+    /// Whose.
+    pub key: Key,
+    /// Where.
+    pub places: Vec<[f64; 2]>,
+    /// Drawn as rings.
+    pub hollow: bool,
+}
+
+/// Pairs of numbers that should be the same: the diagonal is drawn.
+#[derive(Clone, Debug)]
+pub struct Scatter {
+    /// Above it.
+    pub title: String,
+    /// Below it.
+    pub x: String,
+    /// Beside it.
+    pub y: String,
+    /// Whose.
+    pub key: Key,
+    /// Where.
+    pub places: Vec<[f64; 2]>,
+}
+
+type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
+type Drawn = Result<(), Box<dyn Error + Send + Sync>>;
+type Plane<'a> = ChartContext<'a, SVGBackend<'a>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
+
+/// Charts of curves, two beside each other.
+///
+/// # Errors
+/// When the library refuses.
+pub fn curves(charts: &[Chart]) -> Result<String, ReportError> {
+    let keys = keys(charts.iter().flat_map(|chart| chart.lines.iter().map(|line| &line.key)));
+    let columns = charts.len().clamp(1, 2);
+    let rows = charts.len().div_ceil(columns);
+    figure(&keys, CHART_HEIGHT * rows as u32, |area| {
+        for (chart, part) in charts.iter().zip(area.split_evenly((rows, columns))) {
+            draw_curves(chart, &part)?;
+        }
+        Ok(())
+    })
+}
+
+/// Charts of rows, all of the same methods, beside each other.
+///
+/// # Errors
+/// When the library refuses.
+pub fn rows(charts: &[Rows]) -> Result<String, ReportError> {
+    let Some(first) = charts.first() else { return Ok(String::new()) };
+    let height = ROWS_FRAME + ROW_HEIGHT * first.rows.len() as u32;
+    let longest = first.rows.iter().map(|row| row.key.label.chars().count()).max().unwrap_or(0);
+    let labels = (longest as i32 * 8 + 18).clamp(60, 330);
+    figure(&[], height, |area| {
+        let (left, right) = area.split_horizontally(labels);
+        let mut heights = Vec::new();
+        for (chart, part) in charts.iter().zip(right.split_evenly((1, charts.len()))) {
+            heights = draw_rows(chart, &part)?;
+        }
+        for (row, y) in first.rows.iter().zip(heights) {
+            let style = text(16).pos(Pos::new(HPos::Right, VPos::Center));
+            left.draw_text(&row.key.label, &style, (labels - 8, y))?;
+        }
+        Ok(())
+    })
+}
+
+/// A map of points.
+///
+/// # Errors
+/// When the library refuses.
+pub fn map(title: &str, points: &[Points]) -> Result<String, ReportError> {
+    let keys = keys(points.iter().map(|points| &points.key));
+    figure(&keys, 560, |area| {
+        let all = || points.iter().flat_map(|points| &points.places);
+        let span = |axis: usize| padded(all().map(|place| place[axis]), 0.05);
+        let (x, y) = (span(0), span(1));
+        let mut chart = ChartBuilder::on(area)
+            .margin(14)
+            .caption(title, text(18))
+            .build_cartesian_2d(x[0]..x[1], y[0]..y[1])?;
+        // A map's axes mean nothing: it gets a frame and no numbers.
+        chart.configure_mesh().disable_mesh().x_labels(0).y_labels(0).axis_style(FRAME).draw()?;
+        for Points { key, places, hollow } in points {
+            let style = if *hollow { key.colour().stroke_width(2) } else { key.colour().mix(0.75).filled() };
+            chart.draw_series(places.iter().map(|&[x, y]| Circle::new((x, y), 4, style)))?;
+        }
+        Ok(())
+    })
+}
+
+/// Pairs of numbers, then curves, beside each other.
+///
+/// # Errors
+/// When the library refuses.
+pub fn scatters(scatters: &[Scatter], charts: &[Chart]) -> Result<String, ReportError> {
+    let count = scatters.len() + charts.len();
+    figure(&[], CHART_HEIGHT, |area| {
+        let parts = area.split_evenly((1, count));
+        for (scatter, part) in scatters.iter().zip(&parts) {
+            draw_scatter(scatter, part)?;
+        }
+        for (chart, part) in charts.iter().zip(&parts[scatters.len()..]) {
+            draw_curves(chart, part)?;
+        }
+        Ok(())
+    })
+}
+
+fn figure(keys: &[Key], height: u32, draw: impl FnOnce(&Area) -> Drawn) -> Result<String, ReportError> {
+    let legend = legend_places(keys);
+    let legend_height = legend.last().map_or(0, |(_, y)| y + LEGEND_LINE);
+    let mut svg = String::new();
+    let drawn = (|| -> Drawn {
+        let area =
+            SVGBackend::with_string(&mut svg, (WIDTH, height + legend_height as u32)).into_drawing_area();
+        area.fill(&WHITE)?;
+        for (key, &(x, y)) in keys.iter().zip(&legend) {
+            let y = y + LEGEND_LINE / 2;
+            let dash = if key.is_dashed() { 10 } else { 20 };
+            area.draw(&PathElement::new([(x, y), (x + dash, y)], key.colour().stroke_width(3)))?;
+            area.draw_text(&key.label, &text(16).pos(Pos::new(HPos::Left, VPos::Center)), (x + 26, y))?;
+        }
+        draw(&area.split_vertically(legend_height).1)?;
+        Ok(area.present()?)
+    })();
+    drawn.map_err(|error| ReportError::Draw(error.to_string()))?;
+    Ok(svg)
+}
+
+/// Where each label of the legend begins: as many lines as they need.
+fn legend_places(keys: &[Key]) -> Vec<(i32, i32)> {
+    let (left, mut x, mut y) = (70, 70, 0);
+    let place = |key: &Key| {
+        // No font is at hand to measure by; letters are about this wide.
+        let width = 26 + (key.label.chars().count() as f64 * 7.4) as i32 + 22;
+        if x > left && x + width > WIDTH as i32 - 10 {
+            (x, y) = (left, y + LEGEND_LINE);
+        }
+        let place = (x, y);
+        x += width;
+        place
+    };
+    keys.iter().map(place).collect()
+}
+
+fn keys<'a>(all: impl Iterator<Item = &'a Key>) -> Vec<Key> {
+    let mut keys: Vec<Key> = Vec::new();
+    for key in all {
+        if !keys.contains(key) {
+            keys.push(key.clone());
+        }
+    }
+    keys.sort_by_key(|key| key.style);
+    keys
+}
+
+fn draw_curves(chart: &Chart, area: &Area) -> Drawn {
+    let of_line = |line: &Line| {
+        let runs = line.runs.iter().flatten().copied();
+        let band = line.band.iter().flat_map(|&(x, low, high)| [(x, low), (x, high)]);
+        line.points.iter().copied().chain(runs).chain(band).collect::<Vec<_>>()
+    };
+    let all: Vec<(f64, f64)> = chart.lines.iter().flat_map(of_line).collect();
+    let [left, right] = span(all.iter().map(|point| point.0));
+    let ys = all.iter().map(|point| point.1).chain(chart.y_shown.iter().copied()).chain(chart.marked);
+    let [bottom, top] = chart.y_limits.unwrap_or_else(|| padded(ys, 0.05));
+    let mut plane = ChartBuilder::on(area)
+        .margin(10)
+        .margin_right(18)
+        .caption(&chart.title, text(18))
+        .x_label_area_size(46)
+        .y_label_area_size(66)
+        .build_cartesian_2d(left..right, bottom..top)?;
+    let (x_tick, y_tick) = (ticks(left, right), ticks(bottom, top));
+    plane
+        .configure_mesh()
+        .light_line_style(WHITE)
+        .bold_line_style(RGBColor(232, 232, 232))
+        .axis_style(FRAME)
+        .x_labels(6)
+        .y_labels(6)
+        .x_label_formatter(&|x| x_tick(*x))
+        .y_label_formatter(&|y| y_tick(*y))
+        .x_desc(&chart.x)
+        .y_desc(&chart.y)
+        .label_style(text(15))
+        .axis_desc_style(text(16))
+        .draw()?;
+    for line in &chart.lines {
+        draw_line(line, &mut plane)?;
+    }
+    if let Some(y) = chart.marked {
+        plane.draw_series(DashedLineSeries::new([(left, y), (right, y)], 6, 4, GREY.stroke_width(1)))?;
+    }
+    Ok(())
+}
+
+fn draw_scatter(scatter: &Scatter, area: &Area) -> Drawn {
+    let [left, right] = padded(scatter.places.iter().map(|place| place[0]), 0.05);
+    let [bottom, top] = padded(scatter.places.iter().map(|place| place[1]), 0.05);
+    let mut plane = ChartBuilder::on(area)
+        .margin(10)
+        .caption(&scatter.title, text(18))
+        .x_label_area_size(46)
+        .y_label_area_size(66)
+        .build_cartesian_2d(left..right, bottom..top)?;
+    let (x_tick, y_tick) = (ticks(left, right), ticks(bottom, top));
+    plane
+        .configure_mesh()
+        .light_line_style(WHITE)
+        .bold_line_style(RGBColor(232, 232, 232))
+        .axis_style(FRAME)
+        .x_labels(4)
+        .y_labels(6)
+        .x_label_formatter(&|x| x_tick(*x))
+        .y_label_formatter(&|y| y_tick(*y))
+        .x_desc(&scatter.x)
+        .y_desc(&scatter.y)
+        .label_style(text(15))
+        .axis_desc_style(text(16))
+        .draw()?;
+    let (from, to) = (left.max(bottom), right.min(top));
+    if from < to {
+        plane.draw_series(DashedLineSeries::new([(from, from), (to, to)], 6, 4, GREY.stroke_width(1)))?;
+    }
+    let style = scatter.key.colour().mix(0.5).filled();
+    plane.draw_series(scatter.places.iter().map(|&[x, y]| Circle::new((x, y), 2, style)))?;
+    Ok(())
+}
+
+fn draw_line(line: &Line, plane: &mut Plane) -> Drawn {
+    let colour = line.key.colour();
+    if !line.band.is_empty() {
+        let lower = line.band.iter().map(|&(x, low, _)| (x, low));
+        let upper = line.band.iter().rev().map(|&(x, _, high)| (x, high));
+        let outline: Vec<(f64, f64)> = lower.chain(upper).collect();
+        plane.draw_series(std::iter::once(Polygon::new(outline, colour.mix(0.15))))?;
+    }
+    for run in &line.runs {
+        plane.draw_series(LineSeries::new(run.iter().copied(), colour.mix(0.35).stroke_width(1)))?;
+    }
+    let points = line.points.iter().copied();
+    if line.key.is_dashed() {
+        plane.draw_series(DashedLineSeries::new(points, 8, 5, colour.stroke_width(2)))?;
+    } else {
+        plane.draw_series(LineSeries::new(points, colour.stroke_width(2)))?;
+    }
+    // Few points are shown as such: between them nothing was measured.
+    if line.points.len() <= 12 {
+        plane.draw_series(line.points.iter().map(|&point| Circle::new(point, 3, colour.filled())))?;
+    }
+    Ok(())
+}
+
+/// Returns the height of each row, in pixels.
+fn draw_rows(chart: &Rows, area: &Area) -> Result<Vec<i32>, Box<dyn Error + Send + Sync>> {
+    let of_row = |row: &Row| {
+        let ends = row.interval.map_or_else(Vec::new, |(low, high)| vec![low, high]);
+        [vec![row.value], ends, row.runs.clone()].concat()
+    };
+    let all = chart.rows.iter().flat_map(of_row).chain(chart.line).chain(chart.shown.iter().copied());
+    let [left, right] = padded(all, 0.06);
+    let count = chart.rows.len() as f64;
+    let mut plane = ChartBuilder::on(area)
+        .margin_left(14)
+        .margin_right(16)
+        .margin_top(8)
+        .margin_bottom(4)
+        .caption(&chart.title, text(17))
+        .x_label_area_size(34)
+        .build_cartesian_2d(left..right, 0.0..count)?;
+    let tick = ticks(left, right);
+    plane
+        .configure_mesh()
+        .light_line_style(WHITE)
+        .bold_line_style(RGBColor(232, 232, 232))
+        .axis_style(FRAME)
+        .disable_y_mesh()
+        .x_labels(4)
+        .y_labels(0)
+        .x_label_formatter(&|x| tick(*x))
+        .label_style(text(15))
+        .draw()?;
+    if let Some(line) = chart.line {
+        plane.draw_series(DashedLineSeries::new([(line, 0.0), (line, count)], 5, 4, GREY.stroke_width(1)))?;
+    }
+    for (at, row) in chart.rows.iter().enumerate() {
+        let (y, colour) = (count - at as f64 - 0.5, row.key.colour());
+        if let Some((low, high)) = row.interval {
+            let bar = [(low, y - 0.3), (high, y - 0.3), (high, y + 0.3), (low, y + 0.3)];
+            plane.draw_series(std::iter::once(Polygon::new(bar.to_vec(), colour.mix(0.45))))?;
+        }
+        plane.draw_series(row.runs.iter().map(|&run| Circle::new((run, y), 3, colour.mix(0.5).filled())))?;
+        if row.value.is_finite() {
+            let stroke = [(row.value, y - 0.36), (row.value, y + 0.36)];
+            plane.draw_series(LineSeries::new(stroke, colour.stroke_width(3)))?;
+        }
+    }
+    let height = |at: usize| plane.backend_coord(&(left, count - at as f64 - 0.5)).1;
+    Ok((0..chart.rows.len()).map(height).collect())
+}
+
+fn text(size: u32) -> TextStyle<'static> {
+    TextStyle::from(("sans-serif", size).into_font())
+}
+
+/// The lowest and the highest; where they are one, with room about it: an axis has a length.
+fn span(values: impl Iterator<Item = f64>) -> [f64; 2] {
+    let finite = values.filter(|value| value.is_finite());
+    let ends = |[low, high]: [f64; 2], value: f64| [low.min(value), high.max(value)];
+    match finite.fold([f64::INFINITY, f64::NEG_INFINITY], ends) {
+        [low, high] if low > high => [0.0, 1.0],
+        [low, high] if high - low <= low.abs().max(high.abs()) * 1e-9 => {
+            let room = (low.abs() * 0.05).max(0.5);
+            [low - room, high + room]
+        }
+        ends => ends,
+    }
+}
+
+/// From a little below the lowest to a little above the highest.
+fn padded(values: impl Iterator<Item = f64>, share: f64) -> [f64; 2] {
+    let [low, high] = span(values);
+    [low - (high - low) * share, high + (high - low) * share]
+}
+
+/// How numbers of an axis are written: thousands and millions in short, as many decimals as tell them apart.
+fn ticks(low: f64, high: f64) -> impl Fn(f64) -> String {
+    let span = high - low;
+    let largest = low.abs().max(high.abs());
+    let (unit, sign) = match largest {
+        largest if largest >= 1e6 => (1e6, " M"),
+        largest if largest >= 1e4 => (1e3, " k"),
+        _ => (1.0, ""),
+    };
+    let decimals = (1.0 - (span / unit).log10()).ceil().clamp(0.0, 4.0) as usize;
+    move |value| match signed(value / unit, decimals) {
+        // Steps of a half would repeat a rounded number.
+        zero if zero == "0" => zero,
+        number => number + sign,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn line(label: &str, style: usize) -> Line {
+        let key = Key { label: label.to_owned(), style };
+        let points = vec![(0.0, 1.0), (5e6, 2.0)];
+        Line { key, points, band: vec![(0.0, 0.5, 1.5), (5e6, 1.0, 3.0)], runs: Vec::new() }
+    }
+
+    #[test]
+    fn a_figure_has_each_label_once_within_its_width() {
+        let lines: Vec<Line> = (0..14).map(|at| line(&format!("a-method-with-a-name-{at:02}"), at)).collect();
+        let chart = Chart { title: "one".to_owned(), lines: lines.clone(), ..Chart::default() };
+        let svg = curves(&[chart.clone(), chart]).unwrap();
+        for line in &lines {
+            assert_eq!(svg.matches(&line.key.label).count(), 1);
+        }
+        let places = legend_places(&keys(lines.iter().map(|line| &line.key)));
+        assert!(
+            places.iter().all(|(x, _)| *x < 800) && places.is_sorted_by_key(|&(x, y)| (y, x)),
+            "{places:?}"
+        );
+        let parsed = roxmltree::Document::parse(&svg).unwrap();
+        assert_eq!(parsed.root_element().tag_name().name(), "svg");
+    }
+
+    #[test]
+    fn axes_are_labelled_with_numbers_that_differ() {
+        let labels = |low: f64, high: f64, at: &[f64]| {
+            let tick = ticks(low, high);
+            at.iter().map(|&value| tick(value)).collect::<Vec<_>>()
+        };
+        assert_eq!(labels(0.0, 5_050_000.0, &[0.0, 2.5e6, 5e6]), ["0.0 M", "2.5 M", "5.0 M"]);
+        assert_eq!(labels(0.0, 50_000.0, &[0.0, 1e4, 5e4]), ["0", "10 k", "50 k"]);
+        assert_eq!(labels(0.0, 1.0, &[0.0, 0.25, 1.0]), ["0.0", "0.2", "1.0"]);
+        assert_eq!(labels(-400.0, -200.0, &[-400.0, -250.0]), ["−400", "−250"]);
+    }
+
+    #[test]
+    fn nothing_and_one_value_can_be_drawn() {
+        let key = Key { label: "a".to_owned(), style: 20 };
+        for value in [f64::NAN, 0.0, -3.5] {
+            let row = Row { key: key.clone(), value, interval: None, runs: Vec::new() };
+            let chart = Rows { title: "t".to_owned(), rows: vec![row], line: None, shown: Vec::new() };
+            roxmltree::Document::parse(&rows(&[chart]).unwrap()).unwrap();
+        }
+        roxmltree::Document::parse(&curves(&[Chart::default()]).unwrap()).unwrap();
+        let points = [Points { key, places: vec![[0.0, 0.0]], hollow: true }];
+        roxmltree::Document::parse(&map("t", &points).unwrap()).unwrap();
+    }
+}

@@ -1,0 +1,197 @@
+//! Learning curves: the paper's figures 2 to 5, zero-shot curves, and returns by the size of teams.
+
+use crate::{
+    Figure, ReportError, Styles,
+    chart::{self, Chart, Line},
+    comparison::{Group, Method},
+    measure::Measure,
+    paper::{FIGURES, PaperFigure},
+};
+use rit_env::{Split, TaskSet};
+use rit_statistics::{mean, t_interval};
+use std::collections::BTreeMap;
+
+const BANDS: &str = "Lines: mean over seeds of the mean over tasks, greedy episodes. Bands: 95 % intervals of Student's t \
+                     over seeds; thin lines: single runs, where there are fewer than 5 seeds.";
+
+/// The paper's figures 2 to 5 as far as there are runs for them, then the groups that none of them shows.
+///
+/// # Errors
+/// When one cannot be drawn.
+pub fn learning_curves(groups: &[Group], styles: &Styles) -> Result<Vec<Figure>, ReportError> {
+    let mut figures = Vec::new();
+    for figure in &FIGURES {
+        let shown = shown(figure, groups);
+        let charts: Vec<Chart> =
+            shown.iter().map(|(group, methods)| chart(group, methods, Split::Training, styles)).collect();
+        if charts.is_empty() {
+            continue;
+        }
+        let there = shown.iter().map(|(group, _)| group.task_set.as_str()).collect::<Vec<_>>();
+        let missing: Vec<&str> =
+            figure.task_sets.iter().copied().filter(|task_set| !there.contains(task_set)).collect();
+        let missing = match (figure.single_task, missing.join(", ")) {
+            (false, missing) if !missing.is_empty() => format!(" No finished runs yet: {missing}."),
+            _ => String::new(),
+        };
+        figures.push(Figure {
+            id: format!("figure-{}", figure.number),
+            title: format!("Figure {} of the paper: {}", figure.number, figure.title),
+            caption: format!("{BANDS}{missing}"),
+            svg: chart::curves(&charts)?,
+        });
+    }
+    let covered = |group: &Group| {
+        FIGURES.iter().any(|figure| shown(figure, groups).iter().any(|(it, _)| it.id == group.id))
+    };
+    for group in groups.iter().filter(|group| !covered(group)) {
+        let methods: Vec<&Method> = group.methods.iter().collect();
+        figures.push(Figure {
+            id: format!("curves-{}", group.id),
+            title: format!("Learning curves: {}", group.title),
+            caption: BANDS.to_owned(),
+            svg: chart::curves(&[chart(group, &methods, Split::Training, styles)])?,
+        });
+    }
+    Ok(figures)
+}
+
+/// The groups and methods of a figure that are there; an ablation needs two methods to show anything.
+fn shown<'a>(figure: &PaperFigure, groups: &'a [Group]) -> Vec<(&'a Group, Vec<&'a Method>)> {
+    let fits = |group: &&Group| {
+        figure.task_sets.contains(&group.task_set.as_str())
+            && figure.single_task == (group.training.len() == 1)
+    };
+    let place = |group: &Group| figure.task_sets.iter().position(|it| *it == group.task_set);
+    let mut shown: Vec<_> = groups
+        .iter()
+        .filter(fits)
+        .map(|group| {
+            let named = |method: &&Method| figure.methods.contains(&method.label.as_str());
+            let all = figure.methods.is_empty();
+            (group, group.methods.iter().filter(|method| all || named(method)).collect::<Vec<_>>())
+        })
+        .filter(|(_, methods)| methods.len() >= if figure.methods.is_empty() { 1 } else { 2 })
+        .collect();
+    shown.sort_by_key(|(group, _)| place(group));
+    shown
+}
+
+/// Curves on tasks that were never trained on, where they were evaluated on schedule.
+///
+/// # Errors
+/// When it cannot be drawn.
+pub fn zero_shot_curves(groups: &[Group], styles: &Styles) -> Result<Option<Figure>, ReportError> {
+    let charts: Vec<Chart> = groups
+        .iter()
+        .map(|group| chart(group, &group.methods.iter().collect::<Vec<_>>(), Split::Testing, styles))
+        .filter(|chart| chart.lines.iter().any(|line| line.points.len() > 1))
+        .collect();
+    if charts.is_empty() {
+        return Ok(None);
+    }
+    Ok(Some(Figure {
+        id: "zero-shot-curves".to_owned(),
+        title: "Zero-shot curves: tasks that were never trained on".to_owned(),
+        caption: BANDS.to_owned(),
+        svg: chart::curves(&charts)?,
+    }))
+}
+
+/// What methods come to by the number of agents, over training and testing tasks.
+///
+/// # Errors
+/// When it cannot be drawn.
+pub fn team_sizes(groups: &[Group], styles: &Styles) -> Result<Option<Figure>, ReportError> {
+    let charts: Vec<Chart> = groups.iter().filter_map(|group| team_size_chart(group, styles)).collect();
+    if charts.is_empty() {
+        return Ok(None);
+    }
+    Ok(Some(Figure {
+        id: "team-size".to_owned(),
+        title: "What methods come to by the number of agents".to_owned(),
+        caption: "Tasks with as many agents count the same, seen or not. Bands: 95 % intervals of Student's t over \
+                  seeds; thin lines: single runs, where there are fewer than 5 seeds. Returns of other team sizes are \
+                  sums over other numbers of agents and landmarks: slopes are to be compared, not heights."
+            .to_owned(),
+        svg: chart::curves(&charts)?,
+    }))
+}
+
+/// Number of agents of a task.
+pub fn team_size(task_set: &str, task: &str) -> Option<usize> {
+    Some(task_set.parse::<TaskSet>().ok()?.task(task).ok()?.spec().n_agents)
+}
+
+fn team_size_chart(group: &Group, styles: &Styles) -> Option<Chart> {
+    let mut sizes: BTreeMap<usize, Vec<(Split, &String)>> = BTreeMap::new();
+    for split in [Split::Training, Split::Testing] {
+        for task in group.tasks(split) {
+            sizes.entry(team_size(&group.task_set, task)?).or_default().push((split, task));
+        }
+    }
+    if sizes.len() < 2 {
+        return None;
+    }
+    let line = |method: &Method| {
+        let of_size = |(size, tasks): (&usize, &Vec<(Split, &String)>)| {
+            let of_run = |run| {
+                let values =
+                    tasks.iter().filter_map(|(split, task)| group.measure.at_the_end(run, *split, task));
+                mean(&values.collect::<Vec<_>>())
+            };
+            (*size as f64, method.runs.iter().map(of_run).collect())
+        };
+        line(method, &sizes.iter().map(of_size).collect::<Vec<_>>(), styles)
+    };
+    let seen = |size: &&usize| sizes[size].iter().any(|(split, _)| *split == Split::Training);
+    let seen: Vec<String> = sizes.keys().filter(seen).map(ToString::to_string).collect();
+    Some(Chart {
+        title: group.title.clone(),
+        x: format!("agents (trained on: {})", seen.join(", ")),
+        y: group.measure.words().to_owned(),
+        y_shown: group.measure.range().map_or_else(Vec::new, |range| range.to_vec()),
+        lines: group.methods.iter().map(line).collect(),
+        ..Chart::default()
+    })
+}
+
+/// One group's curves, of these methods.
+pub fn chart(group: &Group, methods: &[&Method], split: Split, styles: &Styles) -> Chart {
+    let of_method = |method: &&Method| {
+        let curve = group.curve(method, split);
+        let points: Vec<_> = curve.into_iter().map(|(step, values)| (step as f64, values)).collect();
+        line(method, &points, styles)
+    };
+    let over = match group.tasks(split).len() {
+        1 => String::new(),
+        tasks => format!(", mean of {tasks} tasks"),
+    };
+    Chart {
+        title: group.title.clone(),
+        x: "environment steps".to_owned(),
+        y: format!("{}{over}", group.measure.words()),
+        y_shown: match group.measure {
+            Measure::Return => Vec::new(),
+            Measure::WinRate => vec![0.0, 1.0],
+        },
+        lines: methods.iter().map(of_method).collect(),
+        ..Chart::default()
+    }
+}
+
+/// A line of the means of runs, with their interval or the runs themselves.
+pub fn line(method: &Method, points: &[(f64, Vec<f64>)], styles: &Styles) -> Line {
+    let reliable = method.is_reliable();
+    let ends = |(x, values): &(f64, Vec<f64>)| t_interval(values).map(|it| (*x, it.low, it.high));
+    let run = |at: usize| points.iter().map(move |(x, values)| (*x, values[at])).collect();
+    Line {
+        key: styles.key(&method.label),
+        band: if reliable { points.iter().filter_map(ends).collect() } else { Vec::new() },
+        runs: match method.runs.len() {
+            runs if reliable || runs < 2 => Vec::new(),
+            runs => (0..runs).map(run).collect(),
+        },
+        points: points.iter().map(|(x, values)| (*x, mean(values))).collect(),
+    }
+}

@@ -1,0 +1,83 @@
+//! Tables, as Markdown and as HTML.
+
+use std::fmt::Write as _;
+
+/// A table.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Table {
+    /// Its file's name, without ending.
+    pub id: String,
+    /// Above it.
+    pub title: String,
+    /// One for each column; the first column is text, the others are numbers.
+    pub head: Vec<String>,
+    /// Each as long as the head.
+    pub rows: Vec<Vec<String>>,
+    /// Below it: what the numbers are.
+    pub note: String,
+}
+
+impl Table {
+    /// As a file of its own.
+    pub fn markdown(&self) -> String {
+        let line = |cells: &[String]| {
+            let cells = cells.iter().map(|cell| cell.replace('|', "\\|"));
+            format!("| {} |\n", cells.collect::<Vec<_>>().join(" | "))
+        };
+        let ends = self.head.iter().enumerate().map(|(at, _)| if at == 0 { "---" } else { "---:" });
+        let rows = self.rows.iter().map(|row| line(row)).collect::<String>();
+        let rule = ends.collect::<Vec<_>>().join(" | ");
+        let note = if self.note.is_empty() { String::new() } else { format!("\n{}\n", self.note) };
+        format!("# {}\n\n{}| {rule} |\n{rows}{note}", self.title, line(&self.head))
+    }
+
+    /// As part of the page.
+    pub fn html(&self) -> String {
+        let line = |tag: &str, cells: &[String]| {
+            let cells = cells.iter().enumerate().map(|(at, cell)| {
+                let (tag, class) = if at == 0 { ("th", "") } else { (tag, " class=\"n\"") };
+                format!("<{tag}{class}>{}</{tag}>", escaped(cell))
+            });
+            format!("<tr>{}</tr>\n", cells.collect::<String>())
+        };
+        let mut html = format!("<figure class=\"table\" id=\"{}\">\n", escaped(&self.id));
+        // Writing to a String does not fail.
+        let _ =
+            write!(html, "<figcaption>{}</figcaption>\n<div class=\"wide\"><table>\n", escaped(&self.title));
+        let _ = write!(html, "<thead>{}</thead>\n<tbody>\n", line("th", &self.head));
+        self.rows.iter().for_each(|row| html += &line("td", row));
+        html += "</tbody></table></div>\n";
+        if !self.note.is_empty() {
+            let _ = writeln!(html, "<p class=\"note\">{}</p>", escaped(&self.note));
+        }
+        html + "</figure>\n"
+    }
+}
+
+/// Text as HTML shows it.
+pub fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_name_holds_changes_no_table() {
+        let table = Table {
+            id: "t".to_owned(),
+            title: "A <b>".to_owned(),
+            head: vec!["method".to_owned(), "x|y".to_owned()],
+            rows: vec![vec!["a & b".to_owned(), "−1.0".to_owned()]],
+            note: "\"n\"".to_owned(),
+        };
+        let expected = "# A <b>\n\n| method | x\\|y |\n| --- | ---: |\n| a & b | −1.0 |\n\n\"n\"\n";
+        assert_eq!(table.markdown(), expected);
+        let html = table.html();
+        let parsed = roxmltree::Document::parse(&html).unwrap();
+        let cells = parsed.descendants().filter(|node| node.has_tag_name("td"));
+        assert_eq!(cells.map(|cell| cell.text().unwrap()).collect::<Vec<_>>(), ["−1.0"]);
+        assert!(html.contains("a &amp; b") && html.contains("A &lt;b&gt;"), "{html}");
+    }
+}

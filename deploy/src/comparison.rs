@@ -1,0 +1,107 @@
+//! `rit report`: the experimental section of a paper, from runs that are over.
+
+use crate::{cli::ReportOptions, failure::Failure, output, representations};
+use rit_report::{Measure, Options, Report, ReportError, finished, read, report};
+use std::{
+    fs, io,
+    path::{Path, PathBuf},
+    process::ExitCode,
+};
+
+/// What a report's folder holds, and nothing else.
+const ENTRIES: [&str; 5] = ["index.html", "marl-eval.json", "runs.csv", "figures", "tables"];
+
+/// `rit report`.
+///
+/// # Errors
+/// When runs cannot be compared, or the folder holds something else or cannot be written.
+pub fn run(options: &ReportOptions) -> Result<ExitCode, Failure> {
+    check(&options.out, options.force)?;
+    let input = read(&options.runs)?;
+    let settings = Options {
+        measure: options.metric.map(Measure::from),
+        by: input.keys_by(&options.by),
+        pairs: options.pairs.clone(),
+        replications: options.replications,
+        seed: options.seed,
+    };
+    let (groups, unfinished) = finished(&input, &settings)?;
+    let more = vec![representations::section(&groups, options.seed)?];
+    let made = report(&input, &groups, &unfinished, &settings, more)?;
+    write(&made, &options.out)?;
+    let place = options.out.display();
+    if options.json {
+        let files: Vec<_> = made.files.iter().map(|(path, _)| options.out.join(path)).collect();
+        let answer = serde_json::json!({ "out": options.out, "files": files, "said": made.said });
+        output::print(&format!("{answer:#}\n"))?;
+    } else {
+        output::print(&format!(
+            "{}\n{place}/index.html: {} files\n",
+            made.said.join("\n"),
+            made.files.len()
+        ))?;
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Refuses a folder that holds something else than a report, unless it may lie beside it. Asked before the work.
+fn check(out: &Path, force: bool) -> Result<(), Failure> {
+    let wrong = |error: io::Error| Failure::input_message(format!("--out {}: {error}", out.display()));
+    match fs::read_dir(out) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+        Err(error) => Err(wrong(error)),
+        Ok(entries) => {
+            let names: Result<Vec<_>, _> =
+                entries.map(|entry| entry.map(|entry| entry.file_name())).collect();
+            let names = names.map_err(wrong)?;
+            let other = names.iter().find(|name| !ENTRIES.iter().any(|entry| *name == *entry));
+            match other {
+                Some(other) if !force => Err(Failure::input_message(format!(
+                    "--out {} holds something else than a report: {}; choose another folder, or --force writes the report \
+                     beside it",
+                    out.display(),
+                    other.to_string_lossy()
+                ))),
+                _ => Ok(()),
+            }
+        }
+    }
+}
+
+/// Writes all of it beside its place, then moves it there part by part: an earlier report's figures do not stay.
+fn write(made: &Report, out: &Path) -> Result<(), Failure> {
+    let wrong = |error: io::Error| Failure::runtime_message(format!("--out {}: {error}", out.display()));
+    fs::create_dir_all(out).map_err(wrong)?;
+    let fresh = tempfile::Builder::new().prefix(".report-").tempdir_in(out).map_err(wrong)?;
+    for (path, bytes) in &made.files {
+        let path = fresh.path().join(path);
+        path.parent()
+            .map_or(Ok(()), fs::create_dir_all)
+            .and_then(|()| fs::write(&path, bytes))
+            .map_err(wrong)?;
+    }
+    for entry in ENTRIES {
+        let (from, to) = (fresh.path().join(entry), out.join(entry));
+        replace(&from, &to).map_err(wrong)?;
+    }
+    Ok(())
+}
+
+/// Puts one in the place of the other; where there is nothing new, the old goes.
+fn replace(from: &Path, to: &PathBuf) -> io::Result<()> {
+    match fs::symlink_metadata(to) {
+        Ok(there) if there.is_dir() => fs::remove_dir_all(to)?,
+        Ok(_) => fs::remove_file(to)?,
+        Err(_) => {}
+    }
+    if from.exists() { fs::rename(from, to) } else { Ok(()) }
+}
+
+impl From<ReportError> for Failure {
+    fn from(error: ReportError) -> Self {
+        match error {
+            ReportError::Draw(_) | ReportError::Write(_) => Self::runtime(error),
+            _ => Self::input(error),
+        }
+    }
+}
