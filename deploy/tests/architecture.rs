@@ -16,9 +16,22 @@ const CRATES: &[(&str, &[&str])] = &[
     ("common/ipc", &["rit-episode"]),
     ("common/config", &["rit-algo", "rit-env", "rit-episode", "rit-nn"]),
     ("common/policy", &["rit-algo", "rit-config", "rit-episode", "rit-nn"]),
-    ("common/worlds", &["rit-config", "rit-env"]),
+    ("common/record", &["rit-algo", "rit-config", "rit-env"]),
+    ("common/worlds", &["rit-config", "rit-env", "rit-starcraft"]),
     ("proto", &[]),
-    ("actor", &["rit-algo", "rit-config", "rit-env", "rit-episode", "rit-ipc", "rit-proto", "rit-worlds"]),
+    (
+        "actor",
+        &[
+            "rit-algo",
+            "rit-config",
+            "rit-env",
+            "rit-episode",
+            "rit-ipc",
+            "rit-proto",
+            "rit-record",
+            "rit-worlds",
+        ],
+    ),
     (
         "learner",
         &[
@@ -30,6 +43,7 @@ const CRATES: &[(&str, &[&str])] = &[
             "rit-nn",
             "rit-policy",
             "rit-proto",
+            "rit-record",
             "rit-worlds",
         ],
     ),
@@ -145,9 +159,7 @@ fn generated_types_stay_at_the_edges() {
         "learner/src/coordinator/shell.rs",
         "learner/src/coordinator/status.rs",
         "learner/src/episodes_service.rs",
-        "learner/src/evaluation.rs",
-        "learner/src/measured.rs",
-        "learner/src/metrics.rs",
+        "learner/src/messages.rs",
         "learner/src/prometheus.rs",
         "learner/src/rollout_service.rs",
         "learner/src/run.rs",
@@ -209,9 +221,11 @@ fn what_lies_in_a_run_directory_is_opened_as_a_regular_file() {
         "learner/src/tensorboard.rs",
         // Folders.
         "common/config/src/run_lock.rs",
+        "deploy/src/sweep/mod.rs",
         "learner/src/checkpoint.rs",
         "learner/src/replay_log.rs",
-        // What the system tells of processes.
+        // What the system tells of processes, and of itself.
+        "common/record/src/machine.rs",
         "deploy/src/bench/learner.rs",
         "deploy/src/bench/scale.rs",
         "deploy/src/child.rs",

@@ -5,12 +5,11 @@
 //! of the testing tasks.
 
 use crate::{Line, Lines, RecordError, Summary, TaskResult, record::settings, summary::BYTES_MAX};
-use rit_config::RunDir;
+use rit_config::{RunDir, write_whole};
 use serde_json::{Map, Value};
 use std::{
     collections::BTreeMap,
-    fs::{self, OpenOptions},
-    io::{ErrorKind, Write as _},
+    io::ErrorKind,
     path::{Path, PathBuf},
 };
 
@@ -87,9 +86,8 @@ pub fn commit(root: &Path, stem: &Path) -> Result<[PathBuf; 2], RecordError> {
         return Err(RecordError::io(ended)(ErrorKind::AlreadyExists.into()));
     }
     // The second makes it whole: lines without a summary are what a process that was killed has left.
-    fs::write(&metrics, text).map_err(RecordError::io(&metrics))?;
-    let file = OpenOptions::new().write(true).create_new(true).open(&ended);
-    file.and_then(|mut file| file.write_all(&summary)).map_err(RecordError::io(&ended))?;
+    write_whole(&metrics, &text).map_err(RecordError::io(&metrics))?;
+    write_whole(&ended, &summary).map_err(RecordError::io(&ended))?;
     Ok([metrics, ended])
 }
 

@@ -3,7 +3,7 @@
 use crate::{RecordError, is_header};
 use std::{
     collections::BTreeSet,
-    fs::{self, File},
+    fs::{self, OpenOptions},
     io::Read as _,
     path::{Path, PathBuf},
 };
@@ -63,6 +63,7 @@ fn search(folder: &Path, depth: usize, found: &mut Vec<PathBuf>) -> Result<(), R
 /// Whether a file begins as a metrics file does.
 fn is_metrics(path: &Path) -> bool {
     let mut bytes = Vec::new();
-    let begins = File::open(path).and_then(|file| file.take(64).read_to_end(&mut bytes));
+    let opened = rit_config::open_regular(path, OpenOptions::new().read(true));
+    let begins = opened.and_then(|file| file.take(64).read_to_end(&mut bytes));
     begins.is_ok() && (is_header(&bytes) || bytes.starts_with(br#"{"kind":"#))
 }

@@ -1,9 +1,10 @@
 //! What the processes of a cell say, in a file beside the runs: its end is all that a cell leaves which fails before it
 //! begins.
 
+use rit_config::{open_regular, read_regular};
 use rit_record::Cell;
 use std::{
-    fs::{self, DirBuilder, OpenOptions},
+    fs::{DirBuilder, OpenOptions},
     io::{self, Write as _},
     os::unix::fs::{DirBuilderExt as _, OpenOptionsExt as _},
     path::{Path, PathBuf},
@@ -11,6 +12,9 @@ use std::{
 
 /// How a command says that it failed.
 pub const ERROR: &str = "error: ";
+
+/// No log of a cell is longer.
+const BYTES_MAX: u64 = 1 << 32;
 
 /// Of a log's end, what is looked at for its last words, in bytes.
 const LAST_WORDS: usize = 8 << 10;
@@ -22,7 +26,7 @@ pub fn path(dir: &Path, cell: &Cell) -> PathBuf {
 
 /// The last line of a cell's log, if it has one.
 pub fn last_words(dir: &Path, cell: &Cell) -> Option<String> {
-    let text = fs::read(path(dir, cell)).ok()?;
+    let text = read_regular(&path(dir, cell), BYTES_MAX).ok()?;
     let tail = String::from_utf8_lossy(&text[text.len().saturating_sub(LAST_WORDS)..]).into_owned();
     tail.lines().rev().find(|line| !line.trim().is_empty()).map(|line| line.trim().to_owned())
 }
@@ -34,6 +38,6 @@ pub fn last_words(dir: &Path, cell: &Cell) -> Option<String> {
 pub fn append(dir: &Path, cell: &Cell, line: &str) -> io::Result<()> {
     let path = path(dir, cell);
     DirBuilder::new().recursive(true).mode(0o700).create(path.parent().unwrap_or(dir))?;
-    let mut file = OpenOptions::new().create(true).append(true).mode(0o600).open(path)?;
+    let mut file = open_regular(&path, OpenOptions::new().create(true).append(true).mode(0o600))?;
     file.write_all(format!("{line}\n").as_bytes())
 }
