@@ -1,7 +1,7 @@
 //! Connecting to a learner.
 
 use super::{
-    ALPN_HTTP2, Address, CALL_TIMEOUT, CONNECT_TIMEOUT, KEEPALIVE_EVERY, KEEPALIVE_TIMEOUT,
+    ALPN_HTTP2, Address, CALL_TIMEOUT, CONNECT_TIMEOUT, FRAME_BYTES_MAX, KEEPALIVE_EVERY, KEEPALIVE_TIMEOUT,
     LONG_CALL_TIMEOUT,
     files::{FileError, read_authorities, read_certificates, read_key, read_token},
     words,
@@ -225,6 +225,7 @@ pub async fn connect(address: &Address, credentials: &Credentials) -> Result<Cli
         .map_err(no_answer)?
         .connect_timeout(CONNECT_TIMEOUT)
         .tcp_nodelay(true)
+        .max_frame_size(FRAME_BYTES_MAX)
         .http2_keep_alive_interval(KEEPALIVE_EVERY)
         .keep_alive_timeout(KEEPALIVE_TIMEOUT)
         .keep_alive_while_idle(true);

@@ -47,6 +47,10 @@ const CALL_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long a call may take that works: an evaluation, a checkpoint.
 const LONG_CALL_TIMEOUT: Duration = Duration::from_secs(600);
 
+/// Longest HTTP/2 frame that a caller takes. A learner of small batches sends its weights thousands of times a minute,
+/// and HTTP/2's own 16 KiB would cut each piece of them into dozens of frames, with a system call or two for each.
+const FRAME_BYTES_MAX: u32 = 2 * crate::snapshot::PIECE_BYTES as u32;
+
 /// Without a word from the other side for so long, it is pinged.
 const KEEPALIVE_EVERY: Duration = Duration::from_secs(5);
 
