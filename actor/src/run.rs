@@ -291,9 +291,7 @@ impl Actor {
             run_id: run_id.try_into().map_err(|_| ActorError::RunId)?,
             actor,
             lost_leases: LostLeases::default(),
-            weights: Weights::watch(client, config.algorithm.policy_lag, acting_bytes)
-                .await
-                .map_err(|status| RolloutError::Weights(status.into()))?,
+            weights: Weights::new(client, acting_bytes),
             stop: Arc::clone(&stop),
         };
         let (result, mut rolled) = oneshot::channel();

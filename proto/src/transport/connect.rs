@@ -197,10 +197,7 @@ impl Interceptor for EveryCall {
 /// How long a call may take, for both sides. A stream lasts as long as it is wanted.
 fn deadline(method: &GrpcMethod<'static>) -> Option<Duration> {
     match (method.service(), method.method()) {
-        ("rit.v1.Rollout", "Join")
-        | ("rit.v1.Weights", "Watch")
-        | ("rit.v1.Episodes", "Send")
-        | ("rit.v1.Control", "Metrics") => None,
+        ("rit.v1.Rollout", "Join") | ("rit.v1.Episodes", "Send") | ("rit.v1.Control", "Metrics") => None,
         ("rit.v1.Control", "Evaluate" | "Checkpoint") => Some(LONG_CALL_TIMEOUT),
         _ => Some(CALL_TIMEOUT),
     }
