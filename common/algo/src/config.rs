@@ -50,7 +50,7 @@ pub struct ModelConfig {
 pub struct RoleConfig {
     /// l: numbers in a role.
     pub dim: usize,
-    /// r: hidden size of whatever is made of roles, or makes them.
+    /// r: hidden size of the role encoder and of the hyper-networks that roles feed.
     pub hidden_dim: usize,
     /// No variance of a role is less.
     pub variance_floor: f32,
@@ -92,7 +92,7 @@ pub enum ConfigError {
     Heads {
         /// What they split: its name.
         name: &'static str,
-        /// It.
+        /// The size.
         size: usize,
         /// Heads.
         n_heads: usize,

@@ -1,6 +1,6 @@
 //! Inputs of fixed length: the features of all entities in a row, each in its slot (MAPPO and MAT).
 //!
-//! An agent has the slot of its row; the other entities' slots lie behind those of the most agents that any task has.
+//! An agent has the slot of its row; the other entities' slots lie after those of the most agents that any task has.
 //! Slots without an entity, and entities unseen, are zeros.
 
 use crate::Rows;
@@ -50,7 +50,7 @@ impl Slots {
         }
     }
 
-    /// Writes what there is, whoever sees it, `[groups, m d]`: the slots in their order.
+    /// Writes all entities, seen or not, `[groups, m d]`: the slots in their order.
     pub fn states(&self, rows: &Rows, states: &mut Vec<f32>) {
         states.clear();
         states.resize(rows.groups.len() * self.width(), 0.0);

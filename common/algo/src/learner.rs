@@ -55,7 +55,7 @@ impl NotFinite {
 pub struct NamedState<'a> {
     /// What they are called in a checkpoint.
     pub name: &'static str,
-    /// They.
+    /// The numbers.
     pub numbers: Numbers<'a>,
 }
 
@@ -196,7 +196,7 @@ pub trait Learner: Send {
     /// All parameters, in the layout's order.
     fn params(&self) -> &[f32];
 
-    /// What training goes on from, beside the parameters: target network, optimiser, whatever else the method keeps.
+    /// What training goes on from, beside the parameters: target network, optimiser, and the method's own state.
     /// The same names, kinds and lengths at every time of a run.
     fn state(&self) -> Vec<NamedState<'_>>;
 

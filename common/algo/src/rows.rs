@@ -65,7 +65,7 @@ pub struct Rows {
     places: Vec<usize>,
 }
 
-/// What becomes of the states behind the last step of episodes that terminated: no target needs them.
+/// What becomes of the states after the last step of episodes that terminated: no target needs them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum TerminalStates {
     /// They get no rows.

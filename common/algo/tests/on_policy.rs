@@ -166,7 +166,7 @@ fn acting_equals_the_parallel_pass<N: ActorCritic>(
     }
 }
 
-/// Whoever acts beside an episode, and whatever lies in its batch, changes none of its bits.
+/// Other episodes, acted beside it or in its batch, change no bit of an episode.
 fn company_changes_no_bit<N: ActorCritic>(network: &Arc<N>, acting: fn(&Arc<N>, &[f32]) -> Box<dyn Acting>) {
     let params = params(&**network);
     let (episodes, logits) = play(&mut *acting(network, &params), &TEAMS);

@@ -37,7 +37,7 @@ impl Exploration {
     /// `available` has a flag for each action.
     pub fn explore(&mut self, row: usize, available: &[u8]) -> Option<Action> {
         let Choice::EpsilonGreedy(epsilon) = self.choice else { return None };
-        // Drawn whatever ε is, so that the stream stays in step.
+        // Drawn for any ε, so that the stream stays in step.
         let explores = self.rng.random::<f32>() < epsilon;
         explores.then(|| {
             let last = self.last[row].filter(|&last| available[usize::from(last)] != 0);
@@ -56,7 +56,7 @@ impl Exploration {
         (self.choice == Choice::Sampled).then(|| self.rng.random())
     }
 
-    /// The episode's own stream, for whatever else a policy draws in training; none in evaluation.
+    /// The episode's own stream, for a policy's further random numbers in training; none in evaluation.
     pub fn stream(&mut self) -> Option<&mut Rng> {
         (self.choice != Choice::Greedy).then_some(&mut self.rng)
     }

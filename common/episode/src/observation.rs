@@ -43,7 +43,7 @@ pub enum ObservationFault {
 
 /// The state at one decision step, real rows only: agents first, then the other entities.
 ///
-/// Whoever fills it decides the agents' order; seen through a decision order, row k is the k-th to decide.
+/// The caller that fills it chooses the agents' order; seen through a decision order, row k is the k-th to decide.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Observation {
     n_agents: usize,

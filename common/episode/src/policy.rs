@@ -1,4 +1,4 @@
-//! Whoever chooses joint actions: the acting networks, or a script.
+//! What chooses joint actions: the acting networks, or a script.
 
 use crate::{Action, Exploration, Observation};
 

@@ -6,7 +6,7 @@
 use rand::SeedableRng as _;
 use serde::{Deserialize, Serialize};
 
-/// The generator behind every stream.
+/// The generator of every stream.
 pub type Rng = rand_chacha::ChaCha8Rng;
 
 /// What a stream is for. The numbers are part of a run's meaning: never reuse or renumber one.

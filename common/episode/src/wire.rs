@@ -276,7 +276,7 @@ pub struct Expected {
 /// Checks a frame and copies its real rows out: the receiver's only copy.
 ///
 /// # Errors
-/// The first thing found wrong. Whatever the bytes, nothing panics.
+/// The first thing found wrong. No bytes make it panic.
 pub fn decode(header: &Header, payload: &[u8], expected: &Expected) -> Result<Episode, Rejection> {
     let layout = &expected.layout;
     check_header(header, payload, expected)?;
@@ -399,7 +399,7 @@ fn checksum(header: &Header, payload: &[u8]) -> u32 {
     crc.finalize()
 }
 
-/// A real entity's row in the padded order: non-agents begin behind the padded agents.
+/// A real entity's row in the padded order: non-agents begin after the padded agents.
 fn padded_entity(row: usize, n_agents: usize, agents_max: usize) -> usize {
     if row < n_agents { row } else { row - n_agents + agents_max }
 }

@@ -3,7 +3,7 @@
 //! Sleeps rather than a wake-up per freed frame, because sleeping was cheaper. While the learner is the slower side a
 //! wake-up per frame is a context switch per frame; after a sleep several places are free and several frames go at
 //! once. Measured with frames of 64 KiB and a learner that takes 20 µs for each: 2.7 µs of the actor's CPU per frame
-//! against 3.3, and one microsecond less of the learner's. The price is latency that nobody sees: while a sender
+//! against 3.3, and one microsecond less of the learner's. The price is latency that has no effect: while a sender
 //! sleeps, its frames lie ready in the learner's queue.
 
 use std::time::{Duration, Instant};

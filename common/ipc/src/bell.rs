@@ -29,7 +29,7 @@ struct Page {
 #[repr(C, align(64))]
 struct Line(AtomicU32);
 
-/// Its file, behind the run's prefix.
+/// Its file, after the run's prefix.
 pub(crate) const NAME: &str = "bell";
 
 const PAGE_LEN: usize = 4096;

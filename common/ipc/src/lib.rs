@@ -2,7 +2,7 @@
 //! iceoryx2, whose types stay inside, and the only crate with `unsafe` (in `bell`, to map one page).
 //!
 //! - [`RunSpace`] names a place of its own for one life of a run, a learner's: nothing of another is seen, and
-//!   [`RunSpace::remove`] leaves nothing behind.
+//!   [`RunSpace::remove`] leaves nothing there.
 //! - [`EpisodeReceiver`] is the learner's end: it creates the place, waits without polling, and reads frames
 //!   where they lie.
 //! - [`EpisodeSender`] is an actor's end: one copy into shared memory, then it waits for as long as the learner
@@ -29,7 +29,7 @@
 //! let mut sender = EpisodeSender::open(&space, payload_len, Duration::from_secs(10))?;
 //! sender.send(&frame, &stopping)?;
 //!
-//! // Whoever started them all, when they have ended.
+//! // The process that started them all, when they have ended.
 //! space.remove()?;
 //! # Ok(())
 //! # }
@@ -45,7 +45,7 @@
 //! | reaping a publisher that was never connected loses what it delivered | only the learner reaps actors, and connects to them first |
 //! | a publisher that leaves before the learner connected takes its frames along | see [`EpisodeSender`]: leaving is a conversation |
 //! | dead nodes without details are cleaned in the global root | they are skipped, and go with [`RunSpace::remove`] |
-//! | a learner killed while it creates the service makes it impossible to create | a lock tells that nobody is at it, and the half is removed |
+//! | a learner killed while it creates the service makes it impossible to create | a lock tells that no process is making it, and the half is removed |
 //! | a reaper killed at its work may leave a place taken for ever | the learner's place: [`CreateError::StalePlace`]; an actor's: there are some to spare |
 //! | a slice of bytes aligned to 8 takes eight times its length | the payload is a slice of words |
 //! | the first node makes a segment that every user may write to | it is closed to others at once, `shared_memory` |

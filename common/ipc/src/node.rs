@@ -99,7 +99,7 @@ pub(crate) fn create_node(space: &RunSpace, role: Role) -> Result<Node<Service>,
         .signal_handling_mode(SignalHandlingMode::Disabled)
         .create()
         .map_err(|error| IceoryxError::new("creating a node", error))?;
-    // The first node of a run makes a segment that everybody may write to, whatever the umask.
+    // The first node of a run makes a segment that all users may write to, under any umask.
     shared_memory::make_private(space.prefix())
         .map_err(|error| IceoryxError::new("keeping others out of shared memory", error))?;
     Ok(node)

@@ -23,7 +23,7 @@ const OTHER_NODES: usize = 2;
 /// Why the learner's end could not be made.
 #[derive(Debug, thiserror::Error)]
 pub enum CreateError {
-    /// Payloads that cannot lie one behind the other.
+    /// Payloads that cannot lie one after the other.
     #[error("payloads of {payload_len} bytes cannot be aligned: take the length of a PayloadLayout")]
     Unaligned {
         /// The length.
@@ -110,14 +110,14 @@ impl EpisodeReceiver {
         // A dead learner holds the only place for one. Dead actors delivered to a dead learner, if at all.
         node::remove(node::dead_nodes(space.config(), None)?);
         check_room(space, &limits)?;
-        // Before the service, so that whoever finds the service finds the bell.
+        // Before the service, so that a sender that finds the service finds the bell.
         let bell_path = space.segment(crate::bell::NAME);
         let bell = Bell::create(&bell_path)
             .map_err(|error| CreateError::SharedMemory { path: bell_path, source: error.into() })?;
 
         let service = create_service(space, &node, &limits)?;
         let subscriber = service.subscriber_builder().create().map_err(|error| match error {
-            // The lock says that nobody alive has it.
+            // The lock says that no living process has it.
             SubscriberCreateError::ExceedsMaxSupportedSubscribers => {
                 CreateError::StalePlace { directory: space.directory().to_path_buf() }
             }
@@ -130,7 +130,7 @@ impl EpisodeReceiver {
     /// is free again when the frame is dropped.
     ///
     /// While several senders deliver faster than frames are received, those who came first are served first; what
-    /// keeps the others from starving is that nobody rolls more episodes than it was asked for.
+    /// keeps the others from starving is that no actor rolls more episodes than it was asked for.
     ///
     /// # Errors
     /// When iceoryx2 fails.
@@ -169,7 +169,7 @@ impl EpisodeReceiver {
         Ok(node::remove(dead))
     }
 
-    /// Whether its place is still there. What cleans temporary folders may take it away: then nobody new finds it, and a
+    /// Whether its place is still there. What cleans temporary folders may take it away: then no new process finds it, and a
     /// receiver in a fresh one is needed.
     pub fn is_whole(&self) -> bool {
         self.space.is_whole()
@@ -218,8 +218,8 @@ fn check_room(space: &RunSpace, limits: &Limits) -> Result<(), CreateError> {
 /// Opens the service that actors still have of a former learner, or creates it.
 fn create_service(space: &RunSpace, node: &Node<Service>, limits: &Limits) -> Result<Episodes, CreateError> {
     let created = match try_create_service(node, limits)? {
-        // What a learner left that was killed while it created the service. Nobody has opened that, nobody ever
-        // will, and while we have the lock nobody is at work on it.
+        // Left by a learner that was killed while it created the service. No process has opened it or ever will, and
+        // while we hold the lock no process works on it.
         Err(error) if is_half_made(&error) => {
             space.remove_services()?;
             try_create_service(node, limits)?

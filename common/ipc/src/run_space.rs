@@ -28,7 +28,7 @@ const ABANDONED_AFTER: Duration = Duration::from_secs(3600);
 const NODES: &str = "nodes";
 const SERVICES: &str = "services";
 
-/// Names one life's own place for shared memory. Whoever names the same directory is in the same life.
+/// Names one life's own place for shared memory. Processes that name the same directory share a life.
 #[derive(Clone, Debug)]
 pub struct RunSpace {
     directory: PathBuf,
@@ -77,7 +77,7 @@ pub enum DirectoryError {
         /// Why.
         source: io::Error,
     },
-    /// Somebody else may write there.
+    /// Other users may write there.
     #[error("the folder {directory} for shared memory is not private: it has to be yours, with mode 700")]
     NotPrivate {
         /// The directory.
@@ -139,15 +139,15 @@ impl RunSpace {
         let mut config = Config::default();
         config.global.set_root_path(&root);
         config.global.prefix = file_prefix;
-        // Nobody is reaped in passing: see `EpisodeReceiver::reap_dead`.
+        // Dead processes are not cleaned up in passing: see `EpisodeReceiver::reap_dead`.
         config.global.node.cleanup_dead_nodes_on_creation = false;
         config.global.node.cleanup_dead_nodes_on_destruction = false;
         config.global.service.cleanup_dead_nodes_on_open = false;
         Ok(Self { directory, prefix, config })
     }
 
-    /// Makes a place that nobody has used before and nobody guesses, in this folder. `tell` is given its name before it
-    /// is made, so that it can be found again, and removed, whatever happens next.
+    /// Makes a fresh place with an unguessable name in this folder. `tell` is given its name before it is made, so that
+    /// it can be found and removed even if this process dies at any point after that.
     ///
     /// # Errors
     /// When the folder is no good for it, or `tell` fails.
@@ -212,7 +212,7 @@ impl RunSpace {
         let _lock = match self.lock() {
             Ok(Some(lock)) => Some(lock),
             Ok(None) => return Ok(false),
-            // Somebody has removed the directory, and a learner that has lost it has made another.
+            // The directory was removed, and a learner that lost it has made another.
             Err(DirectoryError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => None,
             Err(error) => return Err(error.into()),
         };
@@ -295,7 +295,7 @@ impl RunSpace {
         self.check_directory()
     }
 
-    /// Whether the directory is there and nobody else's.
+    /// Whether the directory is there and belongs to this user alone.
     pub(crate) fn check_directory(&self) -> Result<(), DirectoryError> {
         let metadata = std::fs::symlink_metadata(&self.directory);
         let metadata = metadata.map_err(|source| self.directory_error(source))?;

@@ -25,7 +25,7 @@ pub enum OpenError {
     /// The run's directory.
     #[error(transparent)]
     Directory(#[from] DirectoryError),
-    /// Nobody to send to.
+    /// There is no learner to send to.
     #[error("no learner in {directory} after {waited:.1?}: start it first, with the same run directory")]
     NoLearner {
         /// The run's directory.
@@ -226,7 +226,7 @@ fn find_learner(space: &RunSpace, time_limit: Duration) -> Result<(Node<Service>
     let began = Instant::now();
     let mut backoff = Backoff::new();
     let no_learner = |waited| OpenError::NoLearner { directory: space.directory().to_path_buf(), waited };
-    // The directory is the learner's to make: an actor that outlives its run leaves nothing behind.
+    // The directory is the learner's to make: an actor that outlives its run leaves nothing there.
     while let Err(error) = space.check_directory() {
         match error {
             DirectoryError::Io { source, .. } if source.kind() == ErrorKind::NotFound => {}

@@ -51,8 +51,8 @@ fn free_of(stat: &StatVfs) -> u64 {
     stat.f_bavail.saturating_mul(stat.f_frsize)
 }
 
-/// This user's files in /dev/shm whose name begins with this prefix. Everybody may make files there: those of others
-/// are none of ours, whatever they are called.
+/// This user's files in /dev/shm whose name begins with this prefix. Every user may make files there: files of
+/// other users are never ours, even under our names.
 pub(crate) fn segments(prefix: &str) -> std::io::Result<Vec<PathBuf>> {
     let user = rustix::process::geteuid().as_raw();
     let mut found = Vec::new();
@@ -72,7 +72,7 @@ pub(crate) fn segments(prefix: &str) -> std::io::Result<Vec<PathBuf>> {
     Ok(found)
 }
 
-/// Takes all rights on the files with this prefix from everybody but their user.
+/// Takes all rights on the files with this prefix from all users but their owner.
 pub(crate) fn make_private(prefix: &str) -> std::io::Result<()> {
     for segment in segments(prefix)? {
         let closed = segment.metadata().and_then(|metadata| {

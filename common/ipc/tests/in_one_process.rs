@@ -45,7 +45,7 @@ fn an_episode_comes_out_as_it_went_in() {
 }
 
 #[test]
-fn nobody_else_may_look_into_shared_memory() {
+fn other_users_may_not_look_into_shared_memory() {
     let run = Run::new();
     let mut receiver = run.receiver(limits(1, 2));
     let mut sender = run.sender();
@@ -327,7 +327,7 @@ fn a_directory_open_to_others_is_neither_used_nor_removed() {
 }
 
 #[test]
-fn somebody_elses_file_keeps_the_directory() {
+fn a_foreign_file_keeps_the_directory() {
     let run = Run::new();
     let receiver = run.receiver(limits(1, 2));
     let socket = run.space.directory().join("control.sock");

@@ -23,11 +23,11 @@ pub struct Attention {
     pub heads: usize,
     /// a: size of all heads together.
     pub dim: usize,
-    /// What becomes of a value behind its layer.
+    /// What becomes of a value after its layer.
     values: Values,
 }
 
-/// What becomes of a value behind its layer.
+/// What becomes of a value after its layer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Values {
     /// It goes through ReLU (the paper's attention).
@@ -153,7 +153,7 @@ impl Attention {
         }
     }
 
-    /// The value layer alone, h → a, without what becomes of values behind it.
+    /// The value layer alone, h → a, without what follows it.
     pub fn value(&self) -> Linear {
         self.key_value.output_rows(self.dim..2 * self.dim)
     }

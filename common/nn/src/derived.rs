@@ -1,7 +1,7 @@
 //! Layers that are made of other layers: where two linear maps follow each other, their product is made once for one set
 //! of weights instead of both being applied to every row.
 //!
-//! Derived weights lie behind the parameters in one *extended* buffer, and their gradients behind the parameters'
+//! Derived weights lie after the parameters in one *extended* buffer, and their gradients after the parameters'
 //! gradients, so that networks use a derived layer like any other. [`Derived::extend`] makes them; [`Derived::backward`]
 //! turns their gradients into gradients by the parameters they are made of.
 
@@ -27,7 +27,7 @@ enum Made {
 }
 
 impl Derived {
-    /// None yet, behind this many parameters.
+    /// None yet, after this many parameters.
     pub fn new(parameters: usize) -> Self {
         Self { parameters, len: parameters, made: Vec::new() }
     }

@@ -20,7 +20,7 @@ use crate::{
 use attend::{Tokens, attend, attend_backward};
 use std::ops::Range;
 
-/// The block: attention with its output layer, feed-forward, norms behind the sums.
+/// The block: attention with its output layer, feed-forward, norms after the sums.
 #[derive(Clone, Debug)]
 pub struct HiddenToken {
     attention: Attention,
@@ -38,7 +38,7 @@ pub struct Places<'a> {
     /// First agent row of each time, then how many there are. The rows of a time go on with a prefix of those of the
     /// time before.
     pub agent_times: &'a [usize],
-    /// Which of its group's entities each agent sees. Nobody misses its hidden token.
+    /// Which of its group's entities each agent sees. Each agent always sees its own hidden token.
     pub visible: Visible<'a>,
 }
 
@@ -317,7 +317,7 @@ impl HiddenToken {
         linear::add_row_relu(to.columns(a..2 * a), &layer.bias(params)[a..]);
     }
 
-    /// All behind the attention, of these of the 2R rows.
+    /// All that follows the attention, of these of the 2R rows.
     fn finish(&self, params: &[f32], rows: Range<usize>, state: &mut HiddenTokenState, out: ViewMut<'_>) {
         let HiddenTokenState { u, attended, post_norm, .. } = state;
         let (u, attended) = (View::dense(u, self.dim()), View::dense(attended, self.attention.dim));

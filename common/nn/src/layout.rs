@@ -39,7 +39,7 @@ pub struct Layout {
 }
 
 impl Layout {
-    /// Declares a network that may have derived layers. They lie behind all of its parameters, so it declares itself
+    /// Declares a network that may have derived layers. They lie after all of its parameters, so it declares itself
     /// twice: the first time only counts.
     pub fn of<T>(declare: impl Fn(&mut LayoutBuilder) -> T) -> (T, Self) {
         let mut counting = LayoutBuilder::default();
@@ -95,13 +95,13 @@ pub struct LayoutBuilder {
 }
 
 impl LayoutBuilder {
-    /// Adds a parameter behind those declared so far, uniform in ± `bound` at first: PyTorch's 1/√fan_in for linear
+    /// Adds a parameter after those declared so far, uniform in ± `bound` at first: PyTorch's 1/√fan_in for linear
     /// layers, 1/√h for a GRU.
     pub fn add(&mut self, name: impl Into<String>, shape: &[usize], bound: f32) -> Range<usize> {
         self.add_as(name, shape, Initial::Uniform(bound))
     }
 
-    /// Adds a parameter behind those declared so far.
+    /// Adds a parameter after those declared so far.
     pub fn add_as(&mut self, name: impl Into<String>, shape: &[usize], initial: Initial) -> Range<usize> {
         let start = self.layout.len;
         self.layout.len += shape.iter().product::<usize>();

@@ -6,7 +6,7 @@
 //!   for parameters, and writes or adds to input gradients as its documentation says.
 //! - A network is written as its forward pass on a [`tape`], whose operations are these layers.
 //! - Matrices are row-major [`View`]s; [`matmul`] is the one place that speaks to faer.
-//! - Everything runs on the calling thread. Whoever wants threads splits the batch.
+//! - Everything runs on the calling thread. A caller that wants threads splits the batch.
 
 pub mod activation;
 pub mod attention;

@@ -12,7 +12,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 /// What a product does with what stands at its destination.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Accum {
-    /// Writes over it, whatever it holds.
+    /// Overwrites it; its old contents do not matter.
     Replace,
     /// Adds to it.
     Add,
@@ -84,7 +84,7 @@ fn least_rows(inputs: usize, outputs: usize) -> usize {
     if inputs > CHUNK { (SMALL / (inputs * outputs.max(1)) + 1).max(2) } else { 2 }
 }
 
-/// A product with as many rows of zeros behind those of `x` as make `rows`.
+/// A product with as many rows of zeros after those of `x` as make `rows`.
 fn few_rows(
     x: View<'_>,
     mut y: ViewMut<'_>,
@@ -210,7 +210,7 @@ mod tests {
                 let (x, w) = (noise(1, 300 * width), noise(2, outputs * width));
                 let start = noise(3, 300 * outputs);
                 let across = noise(4, inputs * (outputs + margin));
-                // One behind the other: with the weight as (out, in) and as (in, out).
+                // One after the other: with the weight as (out, in) and as (in, out).
                 let run = |first: usize, rows: usize| {
                     let mut y = start[first * outputs..(first + rows) * outputs].to_vec();
                     let mut y_across = y.clone();

@@ -1,4 +1,4 @@
-//! What follows the attention in a transformer's block whose norms stand behind their sums ("post-norm").
+//! What follows the attention in a transformer's block whose norms follow their sums ("post-norm").
 
 use crate::Accum;
 use crate::{

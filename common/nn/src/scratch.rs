@@ -17,7 +17,7 @@ pub struct Buffer {
 }
 
 impl Scratch {
-    /// A buffer exactly this long that holds whatever it held before: to be written whole before it is read.
+    /// A buffer exactly this long with old contents: to be written whole before it is read.
     pub fn take(&mut self, len: usize) -> Buffer {
         // The smallest that is large enough, or else the largest.
         let length = |at: &usize| self.free[*at].len();
@@ -44,7 +44,7 @@ impl Scratch {
 }
 
 impl Buffer {
-    /// Makes it exactly this long. It holds whatever it held before: to be written whole before it is read. Debug
+    /// Makes it exactly this long. Its old contents stay: to be written whole before it is read. Debug
     /// builds fill it with nonsense, so that tests notice what is read too early.
     pub fn fit(&mut self, len: usize) -> &mut [f32] {
         if self.memory.len() < len {

@@ -121,12 +121,12 @@ impl Var {
 /// Memory that tapes leave to those after them.
 ///
 /// Values and gradients have stocks of their own, so that a tape that lives from one part of an update to the next keeps
-/// its values in one place and lets its gradients use what is in the cache of whoever works on it ([`Tape::work_in`]).
+/// its values in one place, while its gradients use memory that the working thread has in its cache ([`Tape::work_in`]).
 #[derive(Debug, Default)]
 pub struct Stock {
     /// Buffers of values and of operations' states.
     pub values: Scratch,
-    /// Buffers of gradients and of whatever does not outlive an operation.
+    /// Buffers of gradients, and temporaries of single operations.
     pub work: Scratch,
 }
 
@@ -135,7 +135,7 @@ pub struct Stock {
 enum Place<'a> {
     /// In a buffer of the tape, dense.
     Here(Buffer),
-    /// With whoever made the tape.
+    /// In memory of the caller that made the tape.
     Borrowed(View<'a>),
     /// It was given back or moved into an operation's state.
     Gone,
@@ -267,7 +267,7 @@ impl<'a> Tape<'a> {
         var
     }
 
-    /// A buffer exactly this long that holds whatever it held before: to be written whole, then [pushed](Tape::push),
+    /// A buffer exactly this long with old contents: to be written whole, then [pushed](Tape::push),
     /// kept as an operation's state, or given back.
     pub fn take(&mut self, len: usize) -> Buffer {
         self.stock.take(len)

@@ -21,7 +21,7 @@ pub struct Encoder {
     value: Linear,
 }
 
-/// What every distinct entity is, to whoever attends over them.
+/// The embedding of every distinct entity, shared by all agents that attend over it.
 #[derive(Clone, Copy, Debug)]
 pub struct Entities {
     /// x, (distinct, h).

@@ -20,7 +20,7 @@ use rit_nn::{
 pub struct Mixer {
     /// Over all present entities.
     pub encoder: Encoder,
-    /// `w1_hidden`, `w2_hidden`, `b2_hidden` and `b1` side by side over c, behind `out` (a → h): [attention ‖ z] to all
+    /// `w1_hidden`, `w2_hidden`, `b2_hidden` and `b1` side by side over c, after `out` (a → h): [attention ‖ z] to all
     /// of them, derived.
     hyper: Linear,
     /// The first of these by itself.

@@ -1,4 +1,4 @@
-//! The contrastive loss over a whole batch, whatever shards its rows lie in.
+//! The contrastive loss over a whole batch, across all shards.
 
 use super::shards::Workers;
 use crate::{Rows, blocks::Discriminator};

@@ -55,7 +55,7 @@ pub struct ValueParts {
 pub enum Role {
     /// The network under training.
     Online,
-    /// Its copy that values the states behind.
+    /// Its copy that values the following states.
     Target,
     /// One step of running episodes.
     Acting,

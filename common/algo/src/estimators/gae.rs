@@ -1,7 +1,7 @@
 //! Generalised advantage estimation (Schulman et al. 2016): how much better an action was than the value said.
 
-/// A_t = δ_t + γ λ A_{t+1} with δ_t = r_t + γ V_{t+1} − V_t, A = 0 behind the last step, of one episode. `rewards` and
-/// `values` (T), in the rewards' unit; `bootstrap` is the value of the state behind the last step: 0 where the episode
+/// A_t = δ_t + γ λ A_{t+1} with δ_t = r_t + γ V_{t+1} − V_t, A = 0 after the last step, of one episode. `rewards` and
+/// `values` (T), in the rewards' unit; `bootstrap` is the value of the state after the last step: 0 where the episode
 /// terminated.
 pub fn advantages(rewards: &[f32], values: &[f64], bootstrap: f64, gamma: f64, lambda: f64) -> Vec<f64> {
     debug_assert_eq!(rewards.len(), values.len());
@@ -38,7 +38,7 @@ mod tests {
         // γ = 1/2, λ = 1/2, so γ λ = 1/4. Rewards 1, 2, 4; values 2, 4, 8.
         // Terminated: δ = 1 + 2 − 2, 2 + 4 − 4, 4 − 8 = 1, 2, −4; A = 1 + 1/4, 2 − 1, −4.
         assert_eq!(advantages(&[1.0, 2.0, 4.0], &[2.0, 4.0, 8.0], 0.0, 0.5, 0.5), [1.25, 1.0, -4.0]);
-        // Truncated with V = 24 behind: the last δ is 4 + 12 − 8 = 8; A = 1 + 4/4, 2 + 8/4, 8.
+        // Truncated with V = 24 after it: the last δ is 4 + 12 − 8 = 8; A = 1 + 4/4, 2 + 8/4, 8.
         assert_eq!(advantages(&[1.0, 2.0, 4.0], &[2.0, 4.0, 8.0], 24.0, 0.5, 0.5), [2.0, 4.0, 8.0]);
         // λ = 0 is one step's error, λ = 1 the discounted return less the value.
         assert_eq!(advantages(&[1.0, 2.0], &[3.0, 4.0], 0.0, 0.5, 0.0), [0.0, -2.0]);

@@ -209,7 +209,7 @@ fn normalized_sum(tape: &mut Tape<'_>, norm: &LayerNorm, x: Var, z: Var) -> Var 
     y
 }
 
-/// A transformer's attention: linear values, and a projection behind the heads.
+/// A transformer's attention: linear values, and a projection after the heads.
 #[derive(Clone, Debug)]
 struct MultiHead {
     attention: Attention,
@@ -383,7 +383,7 @@ impl DecoderBlock {
         self.finish(tape, encoded, attended)
     }
 
-    /// What comes behind both attentions; `own` is what the encoder made of the rows.
+    /// What follows both attentions; `own` is what the encoder made of the rows.
     fn finish(&self, tape: &mut Tape<'_>, own: Var, attended: Var) -> Var {
         let y = normalized_sum(tape, &self.norm2, own, attended);
         let hidden = self.mlp.forward(tape, y);

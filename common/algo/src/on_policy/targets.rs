@@ -17,7 +17,7 @@ pub struct Said {
     pub log_probs: Vec<f32>,
     /// `[T, n]`.
     pub entropies: Vec<f32>,
-    /// In normalised units, `[T + 1, v]`: 0 behind the last step where no target needs them.
+    /// In normalised units, `[T + 1, v]`: 0 after the last step where no target needs them.
     pub values: Vec<f32>,
 }
 

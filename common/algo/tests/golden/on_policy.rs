@@ -259,7 +259,7 @@ impl Networks<'_> {
             let theirs = expected.f32(name);
             report.values(name, &cells.padded(of_episode, theirs.len(), 0), &theirs);
         }
-        // The states behind the last step are there where they are kept.
+        // The states after the last step are there where they are kept.
         if terminal_states == TerminalStates::Kept {
             let of_states: [(&str, OfEpisode<'_>); 2] = [
                 ("old_values", &|at| targets[at].old.values.clone()),

@@ -231,7 +231,7 @@ impl Compared<'_> {
         let (cells, agents_max) = (&self.cells, self.case.config.agents_max);
         let scalars = &self.case.scalars;
         for (name, shape) in expected.shapes().into_iter().filter(|(name, _)| !scalars.contains_key(name)) {
-            // Of the state behind a step: they say what its target is made of.
+            // Of the state after a step: they say what its target is made of.
             let behind = matches!(name.as_str(), "greedy_actions" | "target_q_total");
             let theirs: Vec<f32> = if name == "greedy_actions" {
                 expected.i32(&name).into_iter().map(|action| action as f32).collect()
@@ -243,7 +243,7 @@ impl Compared<'_> {
                 for time in 0..steps {
                     let state = &said[&(episode, time + usize::from(behind))];
                     let Some(values) = state.get(name.as_str()) else {
-                        panic!("{}: nobody says {name}", report.case)
+                        panic!("{}: the learner reports no {name}", report.case)
                     };
                     let cell = episode * shape[1] + time;
                     ours.extend_from_slice(&values.numbers);

@@ -93,7 +93,7 @@ proptest! {
 
 #[test]
 fn rows_lie_where_the_layout_says() {
-    // Two agents of at most four, two other entities: rows 0, 1 and, behind the padded agents, 4, 5.
+    // Two agents of at most four, two other entities: rows 0, 1 and, after the padded agents, 4, 5.
     let sent = episode(0, 1, 2);
     let frame = frame(&sent);
     let feature = |time: usize, row: usize| {

@@ -231,7 +231,7 @@ fn repeat_rows(rows: &mut [f32], width: usize, times: usize) {
     if times == 1 {
         return;
     }
-    // From behind: a row goes to where only rows stood that have gone already.
+    // From the last: a row goes to where only rows stood that have gone already.
     for row in (0..rows.len() / width / times).rev() {
         for copy in (0..times).rev() {
             rows.copy_within(row * width..(row + 1) * width, (row * times + copy) * width);

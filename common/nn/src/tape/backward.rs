@@ -37,7 +37,7 @@ impl Backward<'_> {
 #[derive(Debug, Default)]
 pub struct Gradients {
     slots: Vec<Slot>,
-    /// Memory for gradients and for whatever does not outlive an operation's backward.
+    /// Memory for gradients, and for temporaries of single backward steps.
     pub work: Scratch,
 }
 

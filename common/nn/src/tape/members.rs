@@ -35,7 +35,7 @@ impl<'a> Tape<'a> {
     pub fn add_to_members(&mut self, x: Var, of_groups: Var, groups: &'a [Group]) {
         self.write_into(x, |values, x, _| spread(groups, values.view(of_groups), x, Share::Whole, true));
         self.record(move |back| {
-            // It belongs to whoever made x, after this.
+            // From here on the gradient belongs to the operation that made x.
             let Some(dx) = back.gradients.take(x) else { return };
             if let Some(mut d) = back.gradients.begin_adding(of_groups) {
                 sum(groups, dx.view(), d.view_mut().data, Share::Whole);

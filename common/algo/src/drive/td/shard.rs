@@ -64,7 +64,7 @@ pub(super) struct Represented<'a> {
 }
 
 impl<'a> Represented<'a> {
-    /// Makes them; values lie in `stock`, whatever passes in the worker's memory.
+    /// Makes them; values lie in `stock`, temporaries in the worker's memory.
     pub(super) fn new(
         task_encoder: &TaskEncoder,
         params: &'a [f32],
