@@ -1,29 +1,27 @@
 //! One game: from its start to battles in it.
 
+mod joining;
+
 use crate::{
-    connection::{Connection, ConnectionError, shown},
+    connection::{Connection, ConnectionError},
     error::StarCraftError,
-    installation::BUILD_MIN,
     messages::{
         Action, ActionRaw, ActionRawUnitCommand, DebugCommand, DebugCreateUnit, DebugGameState,
-        DebugKillUnit, Difficulty, InterfaceOptions, LocalMap, PlayerSetup, PlayerType, Point2D, Race,
-        RequestAction, RequestCreateGame, RequestData, RequestDebug, RequestGameInfo, RequestJoinGame,
-        RequestObservation, RequestPing, RequestQuit, RequestSaveReplay, RequestStep, ResponseCreateGame,
-        ResponseJoinGame, Status, Unit, action_raw, action_raw_unit_command::Target, debug_command::Command,
-        request::Request, request_join_game::Participation, response::Response, response_create_game,
-        response_join_game,
+        DebugKillUnit, Point2D, RequestAction, RequestData, RequestDebug, RequestObservation, RequestQuit,
+        RequestSaveReplay, RequestStep, Status, Unit, action_raw, action_raw_unit_command::Target,
+        debug_command::Command, request::Request, response::Response,
     },
     process::GameProcess,
     unit_types::{CustomTypes, standard_kind},
 };
+use joining::{check_version, create, look_at_the_map};
 use rit_env::combat::{
     CombatSet, TICKS_PER_STEP,
     spawn::Group,
-    translation::{CELLS, Pathing, RawUnit, UnitOrder},
+    translation::{Pathing, RawUnit, UnitOrder},
     world::{Point, Side},
 };
 use std::{
-    path::Path,
     thread,
     time::{Duration, Instant},
 };
@@ -449,82 +447,6 @@ impl Game {
         let units = observation.raw_data.map(|raw| raw.units).unwrap_or_default();
         Ok(units.into_iter().filter(|unit| matches!(unit.owner(), 1 | 2)).collect())
     }
-}
-
-fn check_version(connection: &mut Connection) -> Result<(String, u32), StarCraftError> {
-    let Response::Ping(ping) = connection.ask(Request::Ping(RequestPing {}))? else {
-        return Err(odd("ping"));
-    };
-    let (version, build) = (shown(&ping.game_version()), ping.base_build());
-    if build < BUILD_MIN { Err(StarCraftError::Version { version, build }) } else { Ok((version, build)) }
-}
-
-/// Creates a game against a computer of the set's race, and joins it.
-fn create(connection: &mut Connection, setup: &Setup) -> Result<(), StarCraftError> {
-    let race = match setup.set {
-        CombatSet::Marines | CombatSet::MarinesMaraudersMedivacs => Race::Terran,
-        CombatSet::StalkersZealots | CombatSet::ColossiStalkersZealots => Race::Protoss,
-    };
-    let participant = PlayerSetup { r#type: Some(PlayerType::Participant.into()), ..PlayerSetup::default() };
-    let computer = PlayerSetup {
-        r#type: Some(PlayerType::Computer.into()),
-        race: Some(race.into()),
-        difficulty: Some(Difficulty::VeryHard.into()),
-    };
-    let request = RequestCreateGame {
-        local_map: Some(LocalMap {
-            map_path: Some(setup.map.clone()),
-            map_data: Some(setup.map_data.clone()),
-        }),
-        player_setup: vec![participant, computer],
-        realtime: Some(false),
-        random_seed: Some(setup.random_seed),
-        ..RequestCreateGame::default()
-    };
-    let failed = |request, error: String, details: &str| StarCraftError::Game {
-        request,
-        error,
-        details: shown(&details),
-        map: setup.map.clone(),
-    };
-    match connection.ask(Request::CreateGame(request))? {
-        Response::CreateGame(ResponseCreateGame { error: None, .. }) => {}
-        Response::CreateGame(created) => {
-            let error = response_create_game::Error::try_from(created.error.unwrap_or_default());
-            let name = error.map_or_else(|unknown| unknown.to_string(), |error| format!("{error:?}"));
-            return Err(failed("create_game", name, created.error_details()));
-        }
-        _ => return Err(odd("create_game")),
-    }
-    let request = RequestJoinGame {
-        options: Some(InterfaceOptions { raw: Some(true), score: Some(false) }),
-        participation: Some(Participation::Race(race.into())),
-    };
-    match connection.ask(Request::JoinGame(request))? {
-        Response::JoinGame(ResponseJoinGame { error: None, .. }) => Ok(()),
-        Response::JoinGame(joined) => {
-            let error = response_join_game::Error::try_from(joined.error.unwrap_or_default());
-            let name = error.map_or_else(|unknown| unknown.to_string(), |error| format!("{error:?}"));
-            Err(failed("join_game", name, joined.error_details()))
-        }
-        _ => Err(odd("join_game")),
-    }
-}
-
-/// The map must have the size that battles are made for; returns which of its cells can be walked.
-fn look_at_the_map(connection: &mut Connection, setup: &Setup) -> Result<Pathing, StarCraftError> {
-    let Response::GameInfo(info) = connection.ask(Request::GameInfo(RequestGameInfo {}))? else {
-        return Err(odd("game_info"));
-    };
-    let raw = info.start_raw.unwrap_or_default();
-    let size = raw.map_size.unwrap_or_default();
-    let cells = CELLS as i32;
-    if (size.x(), size.y()) != (cells, cells) {
-        let map = Path::new(&setup.map).display().to_string();
-        return Err(StarCraftError::MapSize { map, x: size.x(), y: size.y() });
-    }
-    let grid = raw.pathing_grid.unwrap_or_default();
-    Ok(Pathing::read(grid.bits_per_pixel().unsigned_abs(), grid.data())?)
 }
 
 fn observation() -> Request {
