@@ -2,7 +2,7 @@
 
 use crate::{cli::PlayOptions, experiments, failure::Failure, output};
 use rit_algo::{Acting, Model};
-use rit_config::{Config, RunDir, resolve, set};
+use rit_config::{Backend, Config, RunDir, resolve};
 use rit_env::Script;
 use rit_episode::{Policy, RunSeed};
 use rit_learner::{
@@ -139,7 +139,17 @@ impl Player {
 
 /// The configuration, played where these options say.
 fn with_backend(config: Config, options: &PlayOptions) -> Result<Config, Failure> {
-    let Some(backend) = &options.backend else { return Ok(config) };
-    let setting = set(&format!("environment.backend={backend}"))?;
-    Ok(resolve(&config.to_toml()?, "the configuration", &[setting])?)
+    let mut config = config;
+    config.environment.backend = match options.backend.as_deref() {
+        None => return Ok(config),
+        Some("embedded") => Backend::Embedded,
+        Some("starcraft") => Backend::Starcraft,
+        Some(other) => {
+            return Err(Failure::input_message(format!(
+                "--backend {other:?} is none of its choices: embedded, starcraft"
+            )));
+        }
+    };
+    // What goes with the one back end may not go with the other.
+    Ok(resolve(&config.to_toml()?, "the configuration", &[])?)
 }

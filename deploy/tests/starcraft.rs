@@ -254,6 +254,11 @@ fn settings_that_mean_nothing_there_are_refused() {
             "environment.stats means nothing with environment.backend = \"starcraft\"",
         ),
         ("3-8m", &["starcraft.timeout_ms=1"], "starcraft.timeout_ms = 1 is out of range"),
+        (
+            "3-8m",
+            &["starcraft.map=other"],
+            "starcraft.map means nothing with environment.backend = \"embedded\"",
+        ),
     ] {
         let arguments = train(settings);
         let mut arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();

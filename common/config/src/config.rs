@@ -447,6 +447,9 @@ impl Config {
         let mut table = Table::try_from(self).map_err(|error| ConfigError::Value(error.to_string()))?;
         method_keys::retain(&mut table, self.algorithm.name);
         foreign::retain(&mut table, self);
+        if self.environment.backend == Backend::Embedded {
+            table.remove("starcraft");
+        }
         Ok(table)
     }
 

@@ -1,7 +1,8 @@
 //! From what a person typed to a [`Config`].
 
 use crate::{
-    Backend, Config, ConfigError, Environment, KeepBest, SpawnRotate, Until, foreign, keys, method_keys,
+    Backend, Config, ConfigError, Environment, KeepBest, SpawnRotate, StarCraft, Until, foreign, keys,
+    method_keys,
 };
 use rit_algo::{Method, Regime};
 use rit_env::{
@@ -95,10 +96,16 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
     Ok(config)
 }
 
+/// `[starcraft]` as nobody has changed it.
+fn starcraft_default() -> Result<StarCraft, ConfigError> {
+    let section = defaults()?.remove("starcraft").unwrap_or(Value::Table(Table::new()));
+    section.try_into().map_err(|error| wrong_value(&error))
+}
+
 /// What plays in real games, and what only the simulator knows, or only they.
 fn check_backend(config: &Config) -> Result<(), ConfigError> {
     let Environment { task_set, backend, stats, enemy_medivac, .. } = config.environment;
-    let starcraft = &config.starcraft;
+    let (starcraft, default) = (&config.starcraft, starcraft_default()?);
     let (name, meaningless) = match backend {
         Backend::Starcraft if !matches!(task_set, TaskSet::Combat(_)) => {
             return Err(ConfigError::NoBattles { task_set });
@@ -113,9 +120,11 @@ fn check_backend(config: &Config) -> Result<(), ConfigError> {
         Backend::Embedded => (
             "embedded",
             vec![
-                ("starcraft.base_build", starcraft.base_build != 0),
-                ("starcraft.data_version", !starcraft.data_version.is_empty()),
-                ("starcraft.custom_types", starcraft.custom_types != 0),
+                ("starcraft.map", starcraft.map != default.map),
+                ("starcraft.base_build", starcraft.base_build != default.base_build),
+                ("starcraft.data_version", starcraft.data_version != default.data_version),
+                ("starcraft.custom_types", starcraft.custom_types != default.custom_types),
+                ("starcraft.timeout_ms", starcraft.timeout_ms != default.timeout_ms),
             ],
         ),
     };
