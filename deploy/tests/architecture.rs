@@ -17,7 +17,7 @@ const CRATES: &[(&str, &[&str])] = &[
     ("common/config", &["rit-algo", "rit-env", "rit-episode", "rit-nn"]),
     ("common/policy", &["rit-algo", "rit-config", "rit-episode", "rit-nn"]),
     ("common/record", &["rit-algo", "rit-config", "rit-env"]),
-    ("common/worlds", &["rit-config", "rit-env", "rit-starcraft"]),
+    ("common/worlds", &["rit-config", "rit-env", "rit-foreign", "rit-starcraft"]),
     ("proto", &[]),
     (
         "actor",
@@ -215,6 +215,7 @@ fn what_lies_in_a_run_directory_is_opened_as_a_regular_file() {
         "common/config/src/owned_run_dir.rs",
         "deploy/src/beginning.rs",
         "deploy/src/certificates.rs",
+        "deploy/src/comparison.rs",
         "deploy/src/new_file.rs",
         // A log beside the run.
         "deploy/src/soak/fire.rs",

@@ -446,7 +446,10 @@ fn a_model_says_which_size_it_cannot_have() {
         config(|config| config.n_heads = 3).unwrap_err(),
         "network.hidden_dim = 8 is not a multiple of network.n_heads = 3"
     );
-    assert_eq!(config(|config| config.n_blocks = 0).unwrap_err(), "n_blocks is 0; it must be at least 1");
+    assert_eq!(
+        config(|config| config.n_blocks = 0).unwrap_err(),
+        "network.n_blocks is 0; it must be at least 1"
+    );
     // MAPPO has no heads.
     assert!(config(|config| (config.method, config.n_heads) = (Method::Mappo, 3)).is_ok());
 }

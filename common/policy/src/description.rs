@@ -217,7 +217,7 @@ mod tests {
             size("hidden_dim", usize::MAX),
             format!("its size hidden_dim is {}; it must be 1 to 65535", usize::MAX)
         );
-        assert_eq!(size("n_heads", 3), "attention_dim 64 is not a multiple of n_heads 3");
+        assert_eq!(size("n_heads", 3), "network.attention_dim = 64 is not a multiple of network.n_heads = 3");
         assert_eq!(size("entity_dim", 13), "it names 7 features where its sizes say 8");
         assert_eq!(refused(&|d| drop(d.action_names.pop())), "it names 4 actions where its sizes say 5");
         assert!(

@@ -103,10 +103,12 @@ pub fn of_cell(dir: &Path, cell: &Cell, config: &Config) -> Standing {
         }
         (_, Ok((run_dir, _))) => run_dir,
     };
+    let in_use = run_dir.is_in_use();
     match Summary::read(&run_dir).ok().flatten() {
-        Some(summary) => standing.take(&summary),
-        None => {
-            standing.state = if run_dir.is_in_use() { State::Running } else { State::Broken };
+        // A process that has just been interrupted has written its summary and holds the run a moment longer.
+        Some(summary) if summary.ended.is_whole() || !in_use => standing.take(&summary),
+        _ => {
+            standing.state = if in_use { State::Running } else { State::Broken };
             let Progress { env_steps, .. } = last_progress(&run_dir.metrics()).unwrap_or_default();
             standing.env_steps = env_steps;
         }
