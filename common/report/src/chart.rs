@@ -1,11 +1,14 @@
 //! Charts as SVG: curves, intervals in rows, and points, several beside each other under one legend.
 
-use crate::{ReportError, measure::signed};
+mod plane;
+
+use crate::ReportError;
+use plane::{Labels, padded, plane, span, text, ticks};
 use plotters::{
     coord::{Shift, types::RangedCoordf64},
     prelude::{
         Cartesian2d, ChartBuilder, ChartContext, Circle, Color as _, DrawingArea, IntoDrawingArea as _,
-        IntoFont as _, LineSeries, PathElement, Polygon, RGBColor, SVGBackend, TextStyle, WHITE,
+        LineSeries, PathElement, Polygon, RGBColor, SVGBackend, WHITE,
     },
     series::DashedLineSeries,
     style::text_anchor::{HPos, Pos, VPos},
@@ -291,28 +294,8 @@ fn draw_curves(chart: &Chart, area: &Area) -> Drawn {
     let [left, right] = span(all.iter().map(|point| point.0));
     let ys = all.iter().map(|point| point.1).chain(chart.y_shown.iter().copied()).chain(chart.marked);
     let [bottom, top] = chart.y_limits.unwrap_or_else(|| padded(ys, 0.05));
-    let mut plane = ChartBuilder::on(area)
-        .margin(10)
-        .margin_right(18)
-        .caption(&chart.title, text(18))
-        .x_label_area_size(46)
-        .y_label_area_size(66)
-        .build_cartesian_2d(left..right, bottom..top)?;
-    let (x_tick, y_tick) = (ticks(left, right), ticks(bottom, top));
-    plane
-        .configure_mesh()
-        .light_line_style(WHITE)
-        .bold_line_style(RGBColor(232, 232, 232))
-        .axis_style(FRAME)
-        .x_labels(6)
-        .y_labels(6)
-        .x_label_formatter(&|x| x_tick(*x))
-        .y_label_formatter(&|y| y_tick(*y))
-        .x_desc(&chart.x)
-        .y_desc(&chart.y)
-        .label_style(text(15))
-        .axis_desc_style(text(16))
-        .draw()?;
+    let labels = Labels { title: &chart.title, x: &chart.x, y: &chart.y, x_ticks: 6 };
+    let mut plane = plane(area, &labels, [left, right], [bottom, top])?;
     for line in &chart.lines {
         draw_line(line, &mut plane)?;
     }
@@ -325,27 +308,8 @@ fn draw_curves(chart: &Chart, area: &Area) -> Drawn {
 fn draw_scatter(scatter: &Scatter, area: &Area) -> Drawn {
     let [left, right] = padded(scatter.places.iter().map(|place| place[0]), 0.05);
     let [bottom, top] = padded(scatter.places.iter().map(|place| place[1]), 0.05);
-    let mut plane = ChartBuilder::on(area)
-        .margin(10)
-        .caption(&scatter.title, text(18))
-        .x_label_area_size(46)
-        .y_label_area_size(66)
-        .build_cartesian_2d(left..right, bottom..top)?;
-    let (x_tick, y_tick) = (ticks(left, right), ticks(bottom, top));
-    plane
-        .configure_mesh()
-        .light_line_style(WHITE)
-        .bold_line_style(RGBColor(232, 232, 232))
-        .axis_style(FRAME)
-        .x_labels(4)
-        .y_labels(6)
-        .x_label_formatter(&|x| x_tick(*x))
-        .y_label_formatter(&|y| y_tick(*y))
-        .x_desc(&scatter.x)
-        .y_desc(&scatter.y)
-        .label_style(text(15))
-        .axis_desc_style(text(16))
-        .draw()?;
+    let labels = Labels { title: &scatter.title, x: &scatter.x, y: &scatter.y, x_ticks: 4 };
+    let mut plane = plane(area, &labels, [left, right], [bottom, top])?;
     let (from, to) = (left.max(bottom), right.min(top));
     if from < to {
         plane.draw_series(DashedLineSeries::new([(from, from), (to, to)], 6, 4, GREY.stroke_width(1)))?;
@@ -425,47 +389,6 @@ fn draw_rows(chart: &Rows, area: &Area) -> Result<Vec<i32>, Box<dyn Error + Send
     }
     let height = |at: usize| plane.backend_coord(&(left, count - at as f64 - 0.5)).1;
     Ok((0..chart.rows.len()).map(height).collect())
-}
-
-fn text(size: u32) -> TextStyle<'static> {
-    TextStyle::from(("sans-serif", size).into_font())
-}
-
-/// The lowest and the highest; where they are one, with room about it: an axis has a length.
-fn span(values: impl Iterator<Item = f64>) -> [f64; 2] {
-    let finite = values.filter(|value| value.is_finite());
-    let ends = |[low, high]: [f64; 2], value: f64| [low.min(value), high.max(value)];
-    match finite.fold([f64::INFINITY, f64::NEG_INFINITY], ends) {
-        [low, high] if low > high => [0.0, 1.0],
-        [low, high] if high - low <= low.abs().max(high.abs()) * 1e-9 => {
-            let room = (low.abs() * 0.05).max(0.5);
-            [low - room, high + room]
-        }
-        ends => ends,
-    }
-}
-
-/// From a little below the lowest to a little above the highest.
-fn padded(values: impl Iterator<Item = f64>, share: f64) -> [f64; 2] {
-    let [low, high] = span(values);
-    [low - (high - low) * share, high + (high - low) * share]
-}
-
-/// How numbers of an axis are written: thousands and millions in short, as many decimals as tell them apart.
-fn ticks(low: f64, high: f64) -> impl Fn(f64) -> String {
-    let span = high - low;
-    let largest = low.abs().max(high.abs());
-    let (unit, sign) = match largest {
-        largest if largest >= 1e6 => (1e6, " M"),
-        largest if largest >= 1e4 => (1e3, " k"),
-        _ => (1.0, ""),
-    };
-    let decimals = (1.0 - (span / unit).log10()).ceil().clamp(0.0, 4.0) as usize;
-    move |value| match signed(value / unit, decimals) {
-        // Steps of a half would repeat a rounded number.
-        zero if zero == "0" => zero,
-        number => number + sign,
-    }
 }
 
 #[cfg(test)]
