@@ -5,6 +5,7 @@
 //! An actor is its slot. Slots below the wanted count are filled, each by one process at a time, whatever died, left
 //! or was started in whatever order; a slot that is wanted again while its process still leaves waits for its end.
 
+mod lifecycle;
 mod messages;
 mod process;
 mod restarts;
@@ -16,7 +17,8 @@ use crate::{
     failure::{INCOMPATIBLE, UNAVAILABLE},
     report::counted,
 };
-use restarts::{DEATHS_MAX, Restarts};
+use lifecycle::{Process, State, Up};
+use restarts::DEATHS_MAX;
 use rit_record::Ended;
 use std::{collections::BTreeMap, time::Duration};
 
@@ -48,55 +50,6 @@ const LEFT_DELAY: Duration = Duration::from_millis(500);
 
 fn wanted_in_words(actors: u32) -> String {
     format!("{} {} wanted", counted(actors.into(), "actor"), if actors == 1 { "is" } else { "are" })
-}
-
-/// The process of one place.
-#[derive(Debug, Default)]
-struct Process {
-    state: State,
-    restarts: Restarts,
-}
-
-#[derive(Debug, Default)]
-enum State {
-    /// None, and none is awaited.
-    #[default]
-    Down,
-    /// None, and it is started at this moment, with these words if any.
-    Due(Duration, Option<String>),
-    Up(Up),
-}
-
-/// A process that was started and has not ended.
-#[derive(Debug, Default)]
-struct Up {
-    pid: Option<u32>,
-    asked_to_end: bool,
-    /// When it is killed unless it has ended.
-    kill_at: Option<Duration>,
-    killed: bool,
-}
-
-impl Process {
-    fn up(&mut self) -> Option<&mut Up> {
-        match &mut self.state {
-            State::Up(up) => Some(up),
-            _ => None,
-        }
-    }
-
-    fn is_up(&self) -> bool {
-        matches!(self.state, State::Up(_))
-    }
-
-    /// When something is to be done about it.
-    fn deadline(&self) -> Option<Duration> {
-        match &self.state {
-            State::Down => None,
-            State::Due(at, _) => Some(*at),
-            State::Up(up) => up.kill_at.filter(|_| !up.killed),
-        }
-    }
 }
 
 /// What all processes are up to.

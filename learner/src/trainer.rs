@@ -2,6 +2,11 @@
 //! weights; nothing it does depends on time.
 
 mod ending;
+mod evaluating;
+mod messages;
+
+pub use evaluating::evaluation_seed;
+pub use messages::{Checkpointed, News, Standing, TrainError, Work};
 
 use crate::{
     checkpoint::{Loaded, Manifest, Origin, SnapshotMark, TrainingState},
@@ -9,7 +14,7 @@ use crate::{
     evaluation::Evaluator,
     ledger::Terms,
     metrics::{Follower, MetricsFile, Recent},
-    metrics_repair::{End, MetricsError},
+    metrics_repair::End,
     replay::Replay,
     tensorboard::{EventFile, Position},
     weights::{Snapshot, WeightsBoard},
@@ -17,123 +22,22 @@ use crate::{
     writer::Written,
 };
 use rit_algo::{
-    Acting, Learner, Regime,
-    learner::{Draw, Measure, NamedState, NotFinite, StateError},
+    Learner, Regime,
+    learner::{Draw, Measure, NamedState, StateError},
 };
-use rit_config::{Config, KeepBest, RunDir, Until};
-use rit_env::{Split, rollout::LostEpisode};
-use rit_episode::{Episode, Policy, RunSeed, Stream};
+use rit_config::{Config, RunDir, Until};
+use rit_env::Split;
+use rit_episode::{Episode, Stream};
 use rit_policy::weights_file;
 use rit_record::{
-    Best, Build, Ended, Evaluation, Header, Line, Measured, Occasion, Progress, Run, Summary, TaskResult,
-    TrainingPoint, in_words,
+    Best, Build, Ended, Header, Line, Measured, Progress, Run, Summary, TaskResult, TrainingPoint,
 };
 use std::{
     collections::VecDeque,
-    fs, io,
-    path::PathBuf,
+    fs,
     sync::{Arc, mpsc},
 };
 use tokio::sync::oneshot;
-
-/// What the trainer is asked to do, one after another.
-#[derive(Debug)]
-pub enum Work {
-    /// The next batch in order of number.
-    Batch(Vec<Episode>),
-    /// Write a checkpoint now.
-    Checkpoint(oneshot::Sender<Checkpointed>),
-    /// Go on with other settings.
-    Set(Arc<Config>),
-    /// End the run, as this.
-    Stop(Ended),
-}
-
-/// A checkpoint that was asked for.
-#[derive(Debug)]
-pub struct Checkpointed {
-    /// How far training had come.
-    pub progress: Progress,
-    /// Digest of the weights.
-    pub weights_digest: String,
-    /// Comes when it is on disk.
-    pub written: oneshot::Receiver<Written>,
-}
-
-/// How training stands: what status answers are made of.
-#[derive(Clone, Debug, Default)]
-pub struct Standing {
-    /// How far it has come.
-    pub progress: Progress,
-    /// What the last update reported, in the learner's order; nothing before the first update.
-    pub measured: Measured,
-    /// Exploring episodes of late.
-    pub recent: Vec<TaskResult>,
-    /// The newest scheduled evaluation of the training tasks, with the progress it was made at: means.
-    pub evaluation: Option<(Progress, Vec<TaskResult>)>,
-    /// Episodes in replay.
-    pub replay_episodes: usize,
-}
-
-/// What the trainer says while it works.
-#[derive(Debug)]
-pub enum News {
-    /// A batch is done: another may be rolled on these terms.
-    Trained(Terms, Standing),
-    /// The run is over and will take no further batch; its last files are being written.
-    Ending,
-    /// Something that somebody should know of.
-    Warning(String),
-}
-
-/// Why training ended early.
-#[derive(Debug, thiserror::Error)]
-pub enum TrainError {
-    /// The metrics that are there cannot be gone on with.
-    #[error("{path}: {error}")]
-    Metrics {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        error: MetricsError,
-    },
-    /// The configuration cannot be written down.
-    #[error(transparent)]
-    Config(#[from] rit_config::ConfigError),
-    /// The last checkpoint could not be written.
-    #[error("the last checkpoint was not written: {0}; `rit train --resume` goes on from the one before")]
-    Checkpoint(String),
-    /// The summary could not be written.
-    #[error("summary.json was not written: {0}; checkpoints are whole")]
-    Summary(String),
-    /// A file of the run directory could not be written.
-    #[error("{path}: {error}")]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        error: io::Error,
-    },
-    /// An environment of an evaluation could not go on.
-    #[error("the evaluation failed: {0}; `rit train --resume` goes on from the newest checkpoint")]
-    Evaluation(#[from] LostEpisode),
-    /// A checkpoint that is not this learner's.
-    #[error("the checkpoint cannot be gone on from: {0}")]
-    State(#[from] StateError),
-    /// An update that would make weights that are no numbers.
-    #[error(
-        "{error} in update {update}: training has diverged, and would again from its checkpoints, whose weights are \
-         whole; start a new run with a smaller algorithm.lr or algorithm.grad_norm_clip, such as --set algorithm.lr={lr:.0e}"
-    )]
-    NotFinite {
-        /// Its number, from 1.
-        update: u64,
-        /// What is not finite.
-        error: NotFinite,
-        /// A learning rate that may do better.
-        lr: f32,
-    },
-}
 
 /// The trainer.
 pub struct Trainer {
@@ -432,77 +336,10 @@ impl Trainer {
         Ok(())
     }
 
-    /// The scheduled evaluation of the training tasks: always the same episodes, so that one curve's points
-    /// differ by the weights alone.
-    fn evaluate(&mut self) -> Result<(), TrainError> {
-        let progress = self.standing.progress;
-        let results = self.greedy(Split::Training)?;
-        self.record_evaluation(Occasion::Scheduled, Split::Training, &results)?;
-        tracing::info!(env_steps = progress.env_steps, results = %in_words(&results), "evaluated");
-        self.keep_if_best(&results);
-        self.standing.evaluation = Some((progress, results.iter().map(TaskResult::means).collect()));
-        self.evaluated = Some((progress, results));
-        Ok(())
-    }
-
-    /// Keeps the policy if it is better than all before it; of equals the first is kept.
-    fn keep_if_best(&mut self, results: &[TaskResult]) {
-        let keep_best = self.config.checkpoints.keep_best;
-        let Some(value) = measure(keep_best, results) else { return };
-        if self.best.as_ref().is_some_and(|(best, _)| best.value >= value) {
-            return;
-        }
-        let (measure, progress) = (keep_best.name().to_owned(), self.standing.progress);
-        tracing::info!(env_steps = progress.env_steps, measure, value, "the best policy so far");
-        let params = self.learner.params().to_vec();
-        let weights_digest = weights_file::digest(&params);
-        self.best = Some((Best { measure, value, progress, weights_digest, ..Best::default() }, params));
-    }
-
-    /// The scheduled evaluation of the testing tasks, if there are any: nothing is decided by it.
-    fn evaluate_testing(&mut self) -> Result<(), TrainError> {
-        let results = self.greedy(Split::Testing)?;
-        if !results.is_empty() {
-            self.record_evaluation(Occasion::Scheduled, Split::Testing, &results)?;
-            let env_steps = self.standing.progress.env_steps;
-            tracing::info!(env_steps, results = %in_words(&results), "evaluated testing tasks");
-        }
-        Ok(())
-    }
-
-    fn record_evaluation(
-        &mut self,
-        occasion: Occasion,
-        split: Split,
-        results: &[TaskResult],
-    ) -> Result<(), TrainError> {
-        let (progress, wall_s) = (self.standing.progress, self.metrics.wall_s());
-        self.measured(&Line::Evaluation(Evaluation::new(progress, wall_s, occasion, split, results)))
-    }
-
     fn measured(&mut self, line: &Line) -> Result<(), TrainError> {
         self.metrics.write(line).map_err(|error| TrainError::Io { path: self.run_dir.metrics(), error })?;
         self.tensorboard.write(line);
         Ok(())
-    }
-
-    /// The run's own greedy episodes of one split's tasks with the present weights.
-    fn greedy(&self, split: Split) -> Result<Vec<TaskResult>, LostEpisode> {
-        self.roll(acting_params(&*self.learner), split, None, evaluation_seed(&self.config))
-    }
-
-    /// Greedy episodes, on all threads of updates, which have nothing to do meanwhile.
-    fn roll(
-        &self,
-        acting_params: &[f32],
-        split: Split,
-        episodes: Option<usize>,
-        seed: RunSeed,
-    ) -> Result<Vec<TaskResult>, LostEpisode> {
-        let new = |_| Acting::new(self.learner.model(), acting_params);
-        let mut policies: Vec<_> = (0..self.config.learner.threads).map(new).collect();
-        let mut policies: Vec<_> = policies.iter_mut().map(|policy| policy as &mut dyn Policy).collect();
-        self.evaluator.evaluate(&mut policies, &self.config.tasks(split), episodes, seed)
     }
 
     /// Seconds of processor time that the run has taken.
@@ -576,17 +413,6 @@ impl Trainer {
     }
 }
 
-/// What a policy is the best by: the mean over tasks. None where none is kept, or what is no number.
-fn measure(keep_best: KeepBest, results: &[TaskResult]) -> Option<f64> {
-    let of_task = |result: &TaskResult| match keep_best {
-        KeepBest::Never => None,
-        KeepBest::MeanReturn => Some(result.mean_return),
-        KeepBest::WinRate => result.win_rate,
-    };
-    let sum: f64 = results.iter().map(of_task).sum::<Option<f64>>()?;
-    Some(sum / results.len() as f64).filter(|value| value.is_finite())
-}
-
 /// The weights that actors need.
 fn acting_params(learner: &dyn Learner) -> &[f32] {
     &learner.params()[learner.model().acting()]
@@ -620,11 +446,6 @@ fn files(
     let (tensorboard, repaired) = tensorboard.map_err(|error| TrainError::Io { path, error })?;
     warnings.extend(repaired);
     Ok((metrics, tensorboard))
-}
-
-/// The seed of a run's own evaluations, scheduled or asked for without one.
-pub fn evaluation_seed(config: &Config) -> RunSeed {
-    config.seed.derive("evaluation", 0)
 }
 
 #[cfg(test)]
