@@ -196,6 +196,8 @@ impl ModelConfig {
 pub struct UpdateConfig {
     /// γ.
     pub gamma: f32,
+    /// What rewards are multiplied by in TD targets. What networks read of rewards stays as it is.
+    pub reward_scale: f32,
     /// Learning rate.
     pub lr: f32,
     /// Which optimiser.

@@ -3,255 +3,21 @@
 #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "helpers of tests are tests too")]
 #![allow(clippy::let_unit_value, reason = "some methods draw nothing")]
 
-use rand::RngExt as _;
+#[path = "model/networks.rs"]
+#[macro_use]
+mod networks;
+
+use networks::{A, CASES, D, Drawn, Networks, batch, measure};
 use rit_algo::{
-    Learner as _, Method, Model, ModelConfig, PpoConfig, RoleConfig, TerminalStates, UpdateConfig,
+    Learner as _, Method,
     blocks::draw_pairing,
     drive::{SeenShard, TdLearner, ValueActing, ValueNetwork},
     learner::Draw,
-    method::Encoder,
-    methods::{Recurrent, Refil, Roma, Updet, refil::Groups, roma::RoleNoise},
+    methods::{Recurrent, Refil, Roma, Updet},
 };
-use rit_episode::{
-    Choice, End, Episode, Exploration, Observation, Policy, Rng, RunSeed, Stream, Turn, decision_order,
-};
-use rit_nn::{OptimizerKind, gradcheck};
-use std::{
-    collections::HashMap,
-    sync::{Arc, Mutex},
-};
-
-const D: usize = 5;
-const A: usize = 3;
-
-/// Every method of these networks, the encoder's option, and both numbers of heads.
-const CASES: [Case; 15] = [
-    (Method::Rit, Encoder::Beside, 1),
-    (Method::Rit, Encoder::Beside, 2),
-    (Method::RitVdn, Encoder::Beside, 2),
-    (Method::RitNoTaskRepresentations, Encoder::Beside, 2),
-    (Method::QmixAttn, Encoder::Within, 2),
-    (Method::QmixAttn, Encoder::Beside, 1),
-    (Method::VdnAttn, Encoder::Within, 1),
-    (Method::QmixInt, Encoder::Within, 1),
-    (Method::UpdetMix, Encoder::Tokens, 2),
-    (Method::UpdetVdn, Encoder::Tokens, 1),
-    (Method::Refil, Encoder::Within, 2),
-    (Method::Roma, Encoder::Beside, 1),
-    (Method::Roma, Encoder::Within, 2),
-    (Method::Refil, Encoder::Beside, 1),
-    (Method::VdnInt, Encoder::Within, 2),
-];
-
-type Case = (Method, Encoder, usize);
-
-/// Runs the block for each of the cases, with its [`Networks`] under the given name.
-macro_rules! each {
-    ($cases:expr, |$networks:ident| $body:block) => {
-        for &case in $cases {
-            match case.0 {
-                Method::UpdetMix | Method::UpdetVdn => {
-                    let $networks = Networks::new(case, Updet::new);
-                    $body
-                }
-                Method::Refil => {
-                    let $networks = Networks::new(case, Refil::new);
-                    $body
-                }
-                Method::Roma => {
-                    let $networks = Networks::new(case, Roma::new);
-                    $body
-                }
-                _ => {
-                    let $networks = Networks::new(case, Recurrent::new);
-                    $body
-                }
-            }
-        }
-    };
-}
-
-/// A method's networks.
-struct Networks<N> {
-    case: Case,
-    model: Arc<Model>,
-    network: Arc<N>,
-}
-
-/// How to treat what a method draws, and its losses.
-trait Drawn: ValueNetwork {
-    /// As acting without exploration has it.
-    fn quiet(_draws: &mut Self::Draws) {}
-
-    /// As it is where agent k is the former agent `orders[episode][k]`.
-    fn reorder(_draws: &mut Self::Draws, _orders: &[Vec<usize>]) {}
-
-    /// The whole loss, of its named parts.
-    fn loss(part: impl Fn(&str) -> f64) -> f64 {
-        part("td_loss") + part("contrastive_loss")
-    }
-}
-
-impl Drawn for Recurrent {}
-
-impl Drawn for Updet {}
-
-impl Drawn for Refil {
-    fn reorder(groups: &mut Groups, orders: &[Vec<usize>]) {
-        for (groups, order) in groups.iter_mut().zip(orders) {
-            let agents: Vec<u8> = order.iter().map(|&row| groups[row]).collect();
-            groups[..agents.len()].copy_from_slice(&agents);
-        }
-    }
-
-    fn loss(part: impl Fn(&str) -> f64) -> f64 {
-        let weight = f64::from(IMAGINED_WEIGHT);
-        (1.0 - weight) * part("td_loss") + weight * part("imagined_loss")
-    }
-}
-
-impl Drawn for Roma {
-    fn quiet(noise: &mut RoleNoise) {
-        noise.iter_mut().flatten().for_each(|noise| noise.fill(0.0));
-    }
-
-    fn reorder(noise: &mut RoleNoise, orders: &[Vec<usize>]) {
-        for (noise, order) in noise.iter_mut().zip(orders) {
-            for noise in noise {
-                for step in noise.chunks_mut(order.len() * ROLE.dim) {
-                    let before = step.to_vec();
-                    for (to, &row) in step.chunks_mut(ROLE.dim).zip(order) {
-                        to.copy_from_slice(&before[row * ROLE.dim..(row + 1) * ROLE.dim]);
-                    }
-                }
-            }
-        }
-    }
-
-    fn loss(part: impl Fn(&str) -> f64) -> f64 {
-        let weight = f64::from(ROLE.dissimilarity_weight);
-        part("td_loss") + part("role_loss") + weight * part("dissimilarity_loss")
-    }
-}
-
-/// Large, so that a wrong gradient shows.
-const IMAGINED_WEIGHT: f32 = 0.4;
-const ROLE: RoleConfig = RoleConfig {
-    dim: 2,
-    hidden_dim: 5,
-    variance_floor: 0.002,
-    entropy_weight: 0.3,
-    kl_weight: 0.05,
-    dissimilarity_weight: 0.5,
-    soft_constraint: 0.7,
-};
-
-impl<N: Drawn> Networks<N> {
-    fn new(case: Case, network: impl Fn(&ModelConfig) -> N) -> Self {
-        let (method, encoder, n_heads) = case;
-        let config = ModelConfig {
-            method,
-            encoder,
-            entity_dim: D,
-            n_actions: A,
-            hidden_dim: 6,
-            attention_dim: 4,
-            agents_max: 3,
-            entities_max: 5,
-            n_heads,
-            n_blocks: 1,
-            task_representation_dim: 3,
-            reward_embed_dim: 2,
-            mixing_embed_dim: 6,
-            hypernet_embed_dim: 5,
-            feedforward_dim: 7,
-            imagined_weight: IMAGINED_WEIGHT,
-            role: ROLE,
-        };
-        let network = Arc::new(network(&config));
-        Self { case, model: Arc::new(Model::new(config).unwrap()), network }
-    }
-
-    /// Parameters large enough that no gradient hides in rounding.
-    fn params(&self, seed: u64) -> Vec<f32> {
-        gradcheck::noise(seed, self.model.layout().len()).iter().map(|x| 0.7 * x).collect()
-    }
-
-    fn learner(&self, shards: usize, threads: usize, params: Vec<f32>) -> TdLearner<N> {
-        let config = UpdateConfig {
-            gamma: 0.9,
-            lr: 1e-2,
-            optimizer: OptimizerKind::Adam { beta1: 0.9, beta2: 0.999, eps: 1e-8 },
-            grad_norm_clip: 10.0,
-            shards,
-            threads,
-            terminal_states: TerminalStates::LeftOut,
-            ppo: PpoConfig::default(),
-        };
-        TdLearner::new(Arc::clone(&self.model), Arc::clone(&self.network), config, params).unwrap()
-    }
-
-    /// What an update of these episodes draws.
-    fn draws(&self, batch: &[&Episode]) -> N::Draws {
-        self.network.draw(batch, Draw { seed: RunSeed(23), update: 0 })
-    }
-
-    fn quiet(&self, draws: &mut N::Draws) {
-        N::quiet(draws);
-    }
-
-    fn reorder(&self, draws: &mut N::Draws, orders: &[Vec<usize>]) {
-        N::reorder(draws, orders);
-    }
-
-    fn acting(&self, params: &[f32]) -> ValueActing<N> {
-        ValueActing::new(Arc::clone(&self.network), &params[self.network.parts().acting.clone()])
-    }
-}
-
-/// What a learner measures, by name; 0 where it does not.
-fn measure<N: Drawn>(learner: &TdLearner<N>, values: &[f64], name: &str) -> f64 {
-    let measures = learner.measures();
-    let at = measures.iter().position(|measure| measure.name == name);
-    at.map_or(0.0, |at| values[at])
-}
-
-/// An episode of random content: blind and partly blind agents, unavailable actions.
-fn episode(task: usize, n: usize, m: usize, steps: usize, end: End, rng: &mut Rng) -> Episode {
-    let mut available: Vec<u8> = (0..(steps + 1) * n * A).map(|_| rng.random_range(0..2)).collect();
-    let actions: Vec<u8> = (0..steps * n).map(|_| rng.random_range(0..A) as u8).collect();
-    for (row, &action) in actions.iter().enumerate() {
-        available[row * A + usize::from(action)] = 1;
-    }
-    Episode {
-        number: 0,
-        weights_version: 0,
-        task,
-        n_agents: n,
-        n_entities: m,
-        decision_order: decision_order::identity(n),
-        entities: (0..(steps + 1) * m * D).map(|_| rng.random_range(-1.0..1.0)).collect(),
-        observable: (0..(steps + 1) * n * m).map(|_| u8::from(rng.random_range(0..3) > 0)).collect(),
-        available,
-        actions,
-        rewards: (0..steps).map(|_| rng.random_range(-1.0..1.0)).collect(),
-        shaping: vec![0.0; steps],
-        end,
-        won: false,
-    }
-}
-
-/// Tasks of different sizes, lengths and ends.
-fn batch(seed: u64) -> Vec<Episode> {
-    let rng = &mut RunSeed(seed).stream(Stream::Environment, 0);
-    vec![
-        episode(0, 2, 3, 3, End::Terminated, rng),
-        episode(1, 3, 5, 2, End::Truncated, rng),
-        episode(0, 2, 3, 1, End::Terminated, rng),
-        episode(2, 1, 1, 3, End::Truncated, rng),
-        episode(1, 3, 5, 3, End::Truncated, rng),
-    ]
-}
+use rit_episode::{Choice, Episode, Exploration, Observation, Policy, RunSeed, Stream, Turn};
+use rit_nn::gradcheck;
+use std::{collections::HashMap, sync::Mutex};
 
 #[test]
 fn every_parameters_gradient_is_the_numeric_one() {
@@ -536,5 +302,30 @@ fn threads_change_no_bit() {
         let alone = run(1);
         assert_eq!(alone, run(2), "{case:?}");
         assert_eq!(alone, run(4), "{case:?}");
+    });
+}
+
+#[test]
+fn a_reward_scale_makes_targets_of_rewards_so_much_smaller() {
+    // Task representations read rewards, whose size is then another.
+    let without = CASES.iter().filter(|case| !case.0.facts().task_representations);
+    each!(without, |networks| {
+        let episodes = batch(3);
+        let small: Vec<Episode> = episodes
+            .iter()
+            .map(|episode| {
+                let rewards = episode.rewards.iter().map(|reward| 0.25 * reward).collect();
+                Episode { rewards, ..episode.clone() }
+            })
+            .collect();
+        let gradients = |reward_scale, episodes: &[Episode]| {
+            let batch: Vec<&Episode> = episodes.iter().collect();
+            let mut learner = networks.scaled_learner(reward_scale, networks.params(3));
+            let measures = learner.gradients(&batch, &networks.draws(&batch), |rows| (0..rows).collect());
+            (measures, learner.grads().to_vec())
+        };
+        let scaled = gradients(0.25, &episodes);
+        assert_eq!(scaled, gradients(1.0, &small), "{:?}", networks.case);
+        assert_ne!(scaled, gradients(1.0, &episodes), "{:?}", networks.case);
     });
 }

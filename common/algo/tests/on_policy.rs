@@ -57,6 +57,7 @@ fn mat_acting(network: &Arc<Mat>, params: &[f32]) -> Box<dyn Acting> {
 fn config(threads: usize) -> UpdateConfig {
     UpdateConfig {
         gamma: 0.99,
+        reward_scale: 1.0,
         lr: 5e-4,
         optimizer: OptimizerKind::Adam { beta1: 0.9, beta2: 0.999, eps: 1e-5 },
         grad_norm_clip: 10.0,

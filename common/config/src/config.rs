@@ -92,6 +92,8 @@ pub struct Algorithm {
     pub random_permutation: bool,
     #[serde(serialize_with = "number::shortest")]
     pub gamma: f32,
+    #[serde(serialize_with = "number::shortest")]
+    pub reward_scale: f32,
     pub optimizer: OptimizerName,
     #[serde(serialize_with = "number::shortest")]
     pub lr: f32,
@@ -322,6 +324,7 @@ impl Config {
         let algorithm = &self.algorithm;
         UpdateConfig {
             gamma: algorithm.gamma,
+            reward_scale: algorithm.reward_scale,
             lr: algorithm.lr,
             optimizer: match algorithm.optimizer {
                 OptimizerName::RmsProp => {

@@ -5,6 +5,7 @@
 //! task set's preset, below the method's, below the experiment, below the command line. A run directory holds the
 //! resolved one.
 
+mod completed;
 mod config;
 mod error;
 mod foreign;
@@ -19,6 +20,7 @@ mod run_lock;
 mod run_place;
 mod saved;
 
+pub use completed::completed;
 pub use config::{
     Actors, Algorithm, Backend, Checkpoints, Config, Environment, Evaluation, KeepBest, Learner, Network,
     OptimizerName, SpawnRotate, StarCraft, Tls, Training, Until, Web, WebListen, World,

@@ -19,7 +19,8 @@ pub(crate) fn has(method: Method, key: &str) -> bool {
         | "algorithm.exploration_persistence"
         | "algorithm.buffer_size"
         | "algorithm.batch_size"
-        | "algorithm.target_update_interval" => regime == Regime::Replay,
+        | "algorithm.target_update_interval"
+        | "algorithm.reward_scale" => regime == Regime::Replay,
         "algorithm.epochs"
         | "algorithm.minibatches"
         | "algorithm.clip"

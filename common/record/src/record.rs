@@ -5,7 +5,7 @@ use crate::{
     Run, Summary, TrainingPoint,
     committed::{self, Committed},
 };
-use rit_config::{Config, RunDir, is_free};
+use rit_config::{Config, RunDir, completed, is_free};
 use rit_env::Split;
 use serde_json::{Map, Value};
 use std::{
@@ -154,8 +154,8 @@ impl Record {
     fn take_settings(&mut self, settings: BTreeMap<String, String>) {
         self.seed = settings.get("seed").and_then(|seed| seed.parse().ok());
         let of_kind = |(key, _): &(&String, &String)| (!is_free(key) && *key != "seed") || *key == INTERVAL;
-        let kind = settings.iter().filter(of_kind).map(|(key, value)| (key.clone(), value.clone()));
-        self.kind = kind.collect();
+        let kind = completed(settings.clone()).into_iter();
+        self.kind = kind.filter(|(key, value)| of_kind(&(key, value))).collect();
         self.settings = settings;
     }
 

@@ -109,6 +109,23 @@ fn the_seed_and_what_no_result_follows_from_make_no_other_kind() {
 }
 
 #[test]
+fn a_record_from_before_a_setting_existed_had_its_default() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path().join("run");
+    run(&root, &["seed=4"]);
+    end(&root, Ended::Finished);
+    let [jsonl, _] = commit(&root, &folder.path().join("run_seed-4")).unwrap();
+    let today = Record::read(&jsonl).unwrap();
+    let text = fs::read_to_string(&jsonl).unwrap();
+    let before = text.replacen("\"algorithm.reward_scale\":\"1.0\",", "", 1);
+    assert_ne!(before, text);
+    fs::write(&jsonl, before).unwrap();
+    let older = Record::read(&jsonl).unwrap();
+    assert!(!older.settings.contains_key("algorithm.reward_scale"), "what was written stays");
+    assert_eq!(older.kind, today.kind);
+}
+
+#[test]
 fn a_committed_record_says_what_the_run_directory_said() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path().join("run");

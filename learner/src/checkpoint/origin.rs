@@ -76,8 +76,10 @@ impl Origin {
         let mut changed = Vec::new();
         let keys =
             self.settings.keys().chain(other.settings.keys().filter(|key| !self.settings.contains_key(*key)));
+        // The build that wrote the checkpoint may have known fewer keys.
+        let completed = rit_config::completed(other.settings.clone());
         for key in keys {
-            let (now, trained) = (self.settings.get(key), other.settings.get(key));
+            let (now, trained) = (self.settings.get(key), completed.get(key));
             if now == trained {
                 continue;
             }
@@ -116,7 +118,14 @@ mod tests {
             refused("algorithm.gamma", Some("0.5"))
                 .starts_with("it was trained with algorithm.gamma = 0.5, config.toml says 0.99; set it back")
         );
-        assert!(refused("seed", None).starts_with("it was trained with seed = nothing, config.toml says 5"));
+        assert!(refused("seed", None).starts_with("it was trained with seed = 1, config.toml says 5"));
+        // A key that the checkpoint's build did not know had its default then.
+        let mut mine_with_scale = mine.clone();
+        mine_with_scale.settings.insert("algorithm.reward_scale".into(), "1.0".into());
+        assert_eq!(mine_with_scale.may_go_on_from(&mine), Ok(vec![]));
+        mine_with_scale.settings.insert("algorithm.reward_scale".into(), "0.1".into());
+        let error = mine_with_scale.may_go_on_from(&mine).unwrap_err().to_string();
+        assert!(error.contains("algorithm.reward_scale = 1.0, config.toml says 0.1"), "{error}");
         assert!(
             refused("algorithm.luck", Some("1")).contains("algorithm.luck = 1, config.toml says nothing")
         );

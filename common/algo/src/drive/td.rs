@@ -308,7 +308,8 @@ impl<N: ValueNetwork> TdLearner<N> {
         derived.extend(&self.target, &mut extended[1]);
         let tables = extended.each_ref().map(|params| network.tables(params));
         let [online, target] = [0, 1].map(|at| Weights { params: &extended[at], tables: &tables[at] });
-        let update = Update { network, online, target, gamma: config.gamma, totals: totals(batch) };
+        let (gamma, reward_scale) = (config.gamma, config.reward_scale);
+        let update = Update { network, online, target, gamma, reward_scale, totals: totals(batch) };
         let sums = pool.install(|| {
             rows.par_iter_mut().zip(&mut *shards).enumerate().for_each(|(index, (rows, shard))| {
                 rows.fill_from_episodes(&batch[part(batch.len(), count, index)], config.terminal_states);

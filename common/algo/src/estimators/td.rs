@@ -1,6 +1,6 @@
 //! The temporal-difference loss L_TD (paper, equation 6), as a pure function.
 
-/// One filled step's target: r + γ (1 − terminated) Q̄_total(t + 1).
+/// One filled step's target: r + γ (1 − terminated) Q̄_total(t + 1), in the unit of Q_total.
 pub fn target(reward: f32, gamma: f32, terminated: bool, next_target_q_total: f32) -> f32 {
     if terminated { reward } else { reward + gamma * next_target_q_total }
 }

@@ -123,6 +123,7 @@ fn compare_method<N: ActorCritic>(
     let (kind, lr) = case.optimizer.kind();
     let config = UpdateConfig {
         gamma: case.gamma,
+        reward_scale: 1.0,
         lr,
         optimizer: kind,
         grad_norm_clip: case.grad_norm_clip,

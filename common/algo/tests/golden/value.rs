@@ -107,6 +107,7 @@ pub fn compare(
     let (optimizer, lr) = case.optimizer.kind();
     let update = UpdateConfig {
         gamma: case.gamma,
+        reward_scale: 1.0,
         lr,
         optimizer,
         grad_norm_clip: case.grad_norm_clip,

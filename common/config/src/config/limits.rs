@@ -23,6 +23,7 @@ impl Config {
             ("environment.timeout_ms", self.environment.timeout_ms.into(), 1.0, 1e9),
             ("environment.worker_memory_mb", self.environment.worker_memory_mb.into(), 0.0, 1e9),
             ("algorithm.gamma", algorithm.gamma.into(), 0.0, 1.0),
+            ("algorithm.reward_scale", algorithm.reward_scale.into(), 1e-6, 1e6),
             ("algorithm.lr", algorithm.lr.into(), 1e-12, 1.0),
             // At 1 it would never take a gradient in, and every step would be a division by almost nothing.
             ("algorithm.rmsprop_alpha", algorithm.rmsprop_alpha.into(), 0.0, 0.999_999),

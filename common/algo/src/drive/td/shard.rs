@@ -115,6 +115,7 @@ pub(super) struct Update<'a, N: ValueNetwork> {
     pub(super) online: Weights<'a>,
     pub(super) target: Weights<'a>,
     pub(super) gamma: f32,
+    pub(super) reward_scale: f32,
     pub(super) totals: Totals,
 }
 
@@ -306,7 +307,7 @@ impl<N: ValueNetwork> Update<'_, N> {
         let mut d_total = vec![0.0; rows.steps.len()];
         for (group, step) in rows.steps.iter().enumerate().filter(|(_, step)| step.filled) {
             let next = rows.next_group(group).map_or(0.0, |next| target_q_total[next]);
-            let target = td::target(step.reward, self.gamma, step.terminated, next);
+            let target = td::target(step.reward * self.reward_scale, self.gamma, step.terminated, next);
             let (loss, d) = td::squared_error(target, q_total[group], self.totals.filled);
             let [losses, _, q_totals, targets] = sums;
             *losses += loss;

@@ -1,0 +1,85 @@
+//! Settings that an older build wrote down, as this one says them.
+
+use crate::{ConfigError, resolve};
+use std::collections::BTreeMap;
+use toml::{Table, Value};
+
+/// These settings with every key that has been added since, at its default, so that what an older build wrote compares
+/// with what this one writes. Settings that this build does not know, or refuses, stay as they are.
+pub fn completed(settings: BTreeMap<String, String>) -> BTreeMap<String, String> {
+    match today(&settings) {
+        Ok(all) => all.into_iter().chain(settings).collect(),
+        Err(_) => settings,
+    }
+}
+
+/// What this build makes of them, every key.
+fn today(settings: &BTreeMap<String, String>) -> Result<BTreeMap<String, String>, ConfigError> {
+    let mut typed = Table::new();
+    for (key, text) in settings {
+        // Texts were written without quotation marks, and all else as TOML.
+        let parsed =
+            format!("value = {text}").parse::<Table>().ok().and_then(|mut line| line.remove("value"));
+        let value = parsed.unwrap_or_else(|| Value::String(text.clone()));
+        let (table, name) = match key.split_once('.') {
+            Some((section, name)) => {
+                let section = typed.entry(section).or_insert_with(|| Value::Table(Table::new()));
+                let Value::Table(section) = section else { continue };
+                (section, name)
+            }
+            None => (&mut typed, key.as_str()),
+        };
+        table.insert(name.to_owned(), value);
+    }
+    resolve("", "settings of an older build", &[typed])?.settings()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::set;
+
+    fn of(settings: &[(&str, &str)]) -> BTreeMap<String, String> {
+        settings.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect()
+    }
+
+    #[test]
+    fn a_key_of_today_has_its_default_and_what_was_written_stays() {
+        let older = of(&[
+            ("environment.task_set", "3-8m"),
+            ("algorithm.name", "vdn-attn"),
+            ("algorithm.gamma", "0.8"),
+            ("seed", "7"),
+        ]);
+        let today = completed(older.clone());
+        assert_eq!(today["algorithm.reward_scale"], "1.0");
+        assert_eq!(today["environment.spawn_rotate"], "published");
+        assert!(older.iter().all(|(key, value)| today[key] == *value));
+        assert!(!today.contains_key("network.task_representation_dim"), "vdn-attn has none");
+    }
+
+    #[test]
+    fn what_this_build_wrote_is_whole() {
+        for name in ["rit", "mappo", "roma"] {
+            let method = set(&format!("algorithm.name={name}")).unwrap();
+            let config =
+                resolve("environment.task_set = \"cooperative-navigation\"", "test", &[method]).unwrap();
+            let settings = config.settings().unwrap();
+            assert_eq!(completed(settings.clone()), settings);
+            let mut older = settings.clone();
+            older.remove("algorithm.lr");
+            assert_eq!(completed(older)["algorithm.lr"], settings["algorithm.lr"]);
+        }
+    }
+
+    #[test]
+    fn settings_that_this_build_refuses_stay_as_they_are() {
+        for settings in [
+            of(&[("algorithm.name", "dqn"), ("algorithm.gamma", "0.9")]),
+            of(&[("algorithm.wisdom", "1")]),
+            of(&[("algorithm.gamma", "7")]),
+        ] {
+            assert_eq!(completed(settings.clone()), settings);
+        }
+    }
+}
