@@ -1,5 +1,5 @@
 //! Tells the program which commit it is built from: what RIT_COMMIT says, where it is set (a container has no history),
-//! or else what git does. Debug builds are not told, so that a commit makes nobody compile again.
+//! or else what git does. Debug builds are not told, so that a commit alone compiles nothing again.
 
 #![allow(clippy::print_stdout, reason = "that is how a build script speaks to cargo")]
 

@@ -72,7 +72,7 @@ pub struct ActorOptions {
 /// Why an actor ended early, or did not begin.
 #[derive(Debug, thiserror::Error)]
 pub enum ActorError {
-    /// Nobody says where the learner is.
+    /// It is said nowhere where the learner is.
     #[error("no learner runs for {run_dir}: it has no address file ({error}); start `rit learner` first")]
     NoAddress {
         /// The run directory.
@@ -83,7 +83,7 @@ pub enum ActorError {
     /// What the address file says is no address.
     #[error(transparent)]
     Address(#[from] AddressError),
-    /// Nobody answers there.
+    /// No answer comes from there.
     #[error(transparent)]
     Connect(#[from] ConnectError),
     /// An actor of this name is there already, or the builds differ.
@@ -209,7 +209,7 @@ struct Actor {
 }
 
 impl Actor {
-    /// Session after session, until a farewell or until nobody comes back.
+    /// Session after session, until a farewell or until no learner comes back.
     async fn life(&self, mut leaving: watch::Receiver<bool>) -> Result<(), ActorError> {
         let mut gone_since = self.options.supervised.then(Instant::now);
         loop {
@@ -218,7 +218,7 @@ impl Actor {
             if joined {
                 gone_since = Some(Instant::now());
             }
-            // Whoever never met a learner and is not promised one says so at once.
+            // An actor that never met a learner and is not promised one says so at once.
             let Some(since) = gone_since.filter(|_| error.may_pass()) else { return Err(error) };
             if since.elapsed() >= RECONNECT_TIMEOUT {
                 return Err(error);
@@ -317,7 +317,7 @@ impl Actor {
                 return Err(error.map_or(ActorError::Panicked, Into::into));
             }
         };
-        // What is being rolled now is nobody's any more; the thread's place in shared memory must be free again.
+        // What is being rolled now is no longer wanted; the thread's place in shared memory must be free again.
         stop.store(true, Ordering::Relaxed);
         match rolled.await {
             Ok(Err(error @ RolloutError::Environment(_))) => Err(error.into()),

@@ -28,7 +28,7 @@ pub enum SinkError {
     #[error("the stream of episodes to the learner broke")]
     Broken,
     /// The caller's `give_up` said so.
-    #[error("gave up sending a frame: the learner is gone or behind")]
+    #[error("gave up sending a frame: the learner is gone or too slow")]
     GaveUp,
 }
 
@@ -42,7 +42,7 @@ pub(crate) enum EpisodeSink {
 }
 
 impl EpisodeSink {
-    /// Sends a frame; waits while the learner is behind. `give_up` is asked now and then while waiting.
+    /// Sends a frame; waits while the learner cannot keep up. `give_up` is asked now and then while waiting.
     pub(crate) fn send(&mut self, frame: &Frame, give_up: &dyn Fn() -> bool) -> Result<(), SinkError> {
         match self {
             Self::SharedMemory(sender) => Ok(sender.send(frame, give_up)?),
@@ -50,7 +50,7 @@ impl EpisodeSink {
         }
     }
 
-    /// Waits until whatever is told to the learner from now on comes behind the frames sent. In shared memory that
+    /// Waits until whatever is told to the learner from now on comes after the frames sent. In shared memory that
     /// is so by itself: the learner reads it before it takes up what it is told.
     pub(crate) fn flush(&mut self, give_up: &dyn Fn() -> bool) -> Result<(), SinkError> {
         match self {
@@ -81,7 +81,7 @@ impl FrameStream {
         let mut receipts = answer.into_inner();
         let (count, read) = watch::channel(0);
         tokio::spawn(async move {
-            // Ends with the stream, and whoever waits for more learns that.
+            // Ends with the stream, which tells those that wait for more.
             while let Ok(Some(receipt)) = receipts.message().await {
                 if count.send(receipt.frames).is_err() {
                     return;

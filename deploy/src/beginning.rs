@@ -34,7 +34,7 @@ impl Beginning {
         &self.words
     }
 
-    /// Writes the weights into the run's directory, so that the run needs nobody else's.
+    /// Writes the weights into the run's directory, so that the run needs no other file.
     ///
     /// # Errors
     /// When the disk refuses.

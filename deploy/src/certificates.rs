@@ -49,10 +49,10 @@ pub fn run(options: &CertificatesOptions) -> Result<ExitCode, Failure> {
          key = \"{out}/learner.key\"\n\
          client_ca = \"{out}/ca.pem\"\n\
          \n\
-         whoever calls it, with copies of these three files:\n\
+         callers, with copies of these three files:\n\
          --tls-ca {out}/ca.pem --tls-certificate {out}/client.pem --tls-key {out}/client.key\n\
          \n\
-         {out}/ca.key can make further certificates; keep it where nobody else gets at it, or delete it.\n"
+         {out}/ca.key can make further certificates; keep it where others cannot get at it, or delete it.\n"
     ))?;
     Ok(ExitCode::SUCCESS)
 }

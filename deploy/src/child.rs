@@ -59,7 +59,7 @@ pub fn spawn(mut command: Command, log: &Path, lock: Option<BorrowedFd<'_>>) -> 
         .stdin(Stdio::piped())
         .stdout(Stdio::null())
         .stderr(log)
-        // A terminal's Ctrl-C reaches this process alone, which then ends the others in order.
+        // A terminal's Ctrl-C reaches this process alone, which then shuts the others down gracefully.
         .process_group(0);
     if let Some(lock) = lock {
         let parent_fd = lock.try_clone_to_owned()?;

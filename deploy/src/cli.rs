@@ -136,7 +136,7 @@ pub struct TrainOptions {
     /// Print the summary as JSON, and no progress
     #[arg(long)]
     pub json: bool,
-    /// End in order when standard input ends: whoever started this process has gone
+    /// Shut down gracefully when standard input ends: the process that started this one has gone
     #[arg(long, hide = true)]
     pub supervised: bool,
 }
@@ -170,7 +170,7 @@ pub struct LearnerOptions {
     /// Set any key of a new run; may be given again and again
     #[arg(long = "set", value_name = "KEY=VALUE", requires = "new")]
     pub settings: Vec<String>,
-    /// Stop when standard input ends: whoever started this process has gone
+    /// Stop when standard input ends: the process that started this one has gone
     #[arg(long, hide = true)]
     pub supervised: bool,
 }
@@ -188,10 +188,10 @@ pub struct ActorOptions {
     /// Name of this actor, unique in its run
     #[arg(long, default_value = "actor-0")]
     pub name: String,
-    /// Slot that `rit train` fills with this actor: its identity, which it takes over from whoever held it before
+    /// Slot that `rit train` fills with this actor: its identity, which it takes over from the actor that held it before
     #[arg(long, value_name = "N", hide = true)]
     pub slot: Option<u32>,
-    /// Stop when standard input ends: whoever started this process has gone
+    /// Stop when standard input ends: the process that started this one has gone
     #[arg(long, hide = true)]
     pub supervised: bool,
 }

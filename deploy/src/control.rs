@@ -43,7 +43,7 @@ pub async fn connect(run_dir: &RunDir) -> Result<ControlClient<Client>, Failure>
 
 /// Why there is no answer.
 enum Silence {
-    /// Nobody is there.
+    /// No answer comes.
     Absent(Failure),
     /// Somebody is.
     Other(Failure),

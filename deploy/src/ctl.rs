@@ -119,7 +119,7 @@ fn set_request(settings: &[String]) -> Result<SetRequest, Failure> {
     Ok(request)
 }
 
-/// Prints metrics as they come. Whoever reads them may stop reading.
+/// Prints metrics as they come. Their reader may stop reading.
 async fn metrics(
     control: &mut ControlClient<Client>,
     request: MetricsRequest,

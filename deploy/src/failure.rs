@@ -53,7 +53,7 @@ impl Failure {
 
     /// Says the message; returns the exit code.
     pub fn report(&self) -> ExitCode {
-        // The exit code says it too, should nobody be there to be told.
+        // The exit code says it too, should there be no reader.
         let _ = output::say(&format!("error: {self}"));
         ExitCode::from(match self {
             Self::Input(_) => 2,

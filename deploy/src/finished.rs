@@ -117,7 +117,7 @@ impl Finished {
         ))
     }
 
-    /// Why nobody serves its page, and what to do instead.
+    /// Why its page is not served, and what to do instead.
     pub fn no_page(&self) -> Failure {
         let root = self.root.display();
         Failure::runtime_message(format!(
@@ -127,7 +127,7 @@ impl Finished {
     }
 }
 
-/// What was measured of a run at or behind so many environment steps. A line that is none is left out.
+/// What was measured of a run at or after so many environment steps. A line that is none is left out.
 #[derive(Debug)]
 pub struct Metrics {
     lines: Lines,

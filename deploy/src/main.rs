@@ -54,7 +54,7 @@ fn main() -> ExitCode {
     let result = match runtime {
         Ok(runtime) => {
             let result = runtime.block_on(run(cli));
-            // A rollout or an evaluation that nobody waits for any more is not waited for here either.
+            // A rollout or an evaluation that is no longer wanted is not waited for here either.
             runtime.shutdown_background();
             result
         }

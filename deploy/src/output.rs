@@ -1,12 +1,12 @@
 //! What commands print, and what becomes of it where it cannot be written.
 //!
-//! The standard library's print macros panic there; nothing here does. A closed pipe means that whoever read has had
+//! The standard library's print macros panic there; nothing here does. A closed pipe means that the reader has had
 //! enough, and is no failure; a full disk is one.
 
 use crate::failure::Failure;
 use std::io::{self, ErrorKind, Write as _};
 
-/// Whether anybody still reads what is printed.
+/// Whether what is printed still has a reader.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reader {
     /// As far as one can tell.

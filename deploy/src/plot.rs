@@ -31,7 +31,7 @@ pub fn run(options: &PlotOptions) -> Result<ExitCode, Failure> {
             return Err(Failure::input_message(format!("{run}: it holds no evaluation yet")));
         }
         if run.broken_lines > 0 {
-            // It is drawn without them, whether or not anybody is told.
+            // It is drawn without them, whether or not the warning can be printed.
             let _ = output::say(&format!("{run}: {} torn lines are left out", run.broken_lines));
         }
     }

@@ -1,6 +1,6 @@
 //! The live line of `rit train`, and what happens, said as it happens.
 //!
-//! Written by a thread of its own: a terminal that is stopped, or a pipe that nobody reads, holds up nothing but what is
+//! Written by a thread of its own: a terminal that is stopped, or a pipe without a reader, holds up nothing but what is
 //! said there. Everything that is said is in the log too.
 
 use crate::{output, report};
@@ -82,12 +82,12 @@ impl Progress {
 
     fn send(&self, news: News) {
         if let Some(sender) = &self.news {
-            // Nobody reads what waits already.
+            // What waits already has no reader.
             let _ = sender.try_send(news);
         }
     }
 
-    /// Takes the line away when all is written, or nobody reads it.
+    /// Takes the line away when all is written, or it has no reader.
     pub fn finish(&mut self) {
         self.news = None;
         // Nothing is ever sent: it ends when the thread does.

@@ -26,7 +26,7 @@ use rustix::rand::{GetRandomFlags, getrandom};
 use serde::Deserialize;
 use std::{collections::BTreeSet, path::PathBuf, process::ExitCode, sync::Arc};
 
-/// Where whoever is let in is led.
+/// Where browsers that are let in are led.
 const RUNS: &str = "/runs";
 /// Bytes of the token, and of the cookie's name.
 const TOKEN_BYTES: usize = 16;

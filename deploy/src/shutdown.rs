@@ -1,4 +1,4 @@
-//! When a process shall end in order: Ctrl-C, SIGTERM, a terminal that closes, or the end of the process that started
+//! When a process shall shut down gracefully: Ctrl-C, SIGTERM, a terminal that closes, or the end of the process that started
 //! this one.
 
 use std::fs;
@@ -28,7 +28,7 @@ pub fn requested(supervised: bool) -> impl Future<Output = ()> {
             () = next(terminated) => tracing::info!("SIGTERM: ending"),
             () = next(interrupted) => tracing::info!("interrupted: ending"),
             () = next(hung_up) => tracing::info!("SIGHUP: ending"),
-            () = abandoned => tracing::info!("whoever started this process has gone: ending"),
+            () = abandoned => tracing::info!("the process that started this one has gone: ending"),
         }
     }
 }

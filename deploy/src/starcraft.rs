@@ -49,7 +49,7 @@ pub async fn endpoint(options: EndpointOptions, logs: LogOptions) -> Result<Exit
     let address = endpoint.address().map_err(Failure::runtime)?;
     let as_a_game = options.as_a_game;
     let serve = move || if as_a_game { endpoint.serve_as_a_game() } else { endpoint.serve() };
-    // Caught before anybody is told that it listens.
+    // Caught before it says that it listens.
     let shutdown = shutdown::requested(false);
     output::print(&format!("listening on ws://{address}/sc2api\n"))?;
     tokio::select! {

@@ -25,7 +25,7 @@ use std::{collections::BTreeMap, time::Duration};
 pub use messages::{Effect, Event, Exit, Hung, Outcome, Place, Standing};
 pub use shell::watch_over;
 
-/// Exit codes of a learner that has ended a run in order: as somebody asked it to, or as a signal did.
+/// Exit codes of a learner that has ended a run gracefully: as somebody asked it to, or as a signal did.
 const STOPPED: i32 = Ended::Stopped.exit_code() as i32;
 const INTERRUPTED: i32 = Ended::Interrupted.exit_code() as i32;
 
@@ -281,7 +281,7 @@ impl Supervisor {
         {
             return;
         }
-        effects.push(Effect::Say("interrupted: ending the run in order".to_owned()));
+        effects.push(Effect::Say("interrupted: shutting the run down gracefully".to_owned()));
         // Who is not there is not needed any more.
         self.actors.retain(|_, actor| actor.is_up());
         match (&self.phase, &self.contact) {
@@ -305,7 +305,7 @@ impl Supervisor {
         let died = format!("the learner {exit}: {last_words} (log: {log})");
         self.contact = Contact::starting(now);
         match exit {
-            // It has ended the run in order, and its summary says how.
+            // It has ended the run gracefully, and its summary says how.
             Exit::Code(0 | STOPPED) if !self.interrupted => self.end(Outcome::Finished, now, effects),
             Exit::Code(0 | STOPPED | INTERRUPTED) if self.interrupted => {
                 self.end(Outcome::Interrupted, now, effects);
@@ -378,7 +378,7 @@ impl Supervisor {
             return self.give_up(place, last_words, now, effects);
         };
         if *exit == Exit::Code(0) {
-            // A run that ends lets its actors go before it says so: then nobody is to be started.
+            // A run that ends lets its actors go before it says so: then none is to be started.
             let say = format!("{place} had left and is started again");
             self.process(place).state = State::Due(now + delay.max(LEFT_DELAY), Some(say));
             return;

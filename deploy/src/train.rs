@@ -154,7 +154,7 @@ fn print_summary(run_dir: &RunDir, json: bool) -> Result<(), Failure> {
     let finished = Finished::read(run_dir)?;
     let why = match output::print(&if json { finished.json() } else { finished.text() }) {
         Ok(Reader::There) => return Ok(()),
-        Ok(Reader::Gone) => "nobody reads standard output any more".to_owned(),
+        Ok(Reader::Gone) => "standard output has no reader any more".to_owned(),
         Err(failure) => {
             let _ = output::say(&format!("{failure}; the run is whole, and its summary in summary.json"));
             failure.to_string()

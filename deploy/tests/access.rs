@@ -1,4 +1,4 @@
-//! Nobody gets in who should not: what a learner demands over TCP, and what becomes of those who cannot show it.
+//! Only callers that may get in: what a learner demands over TCP, and what becomes of those who cannot show it.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "helpers of tests are tests too")]
 
 mod common;

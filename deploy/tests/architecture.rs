@@ -148,7 +148,7 @@ fn libraries_stay_where_they_are() {
 
 #[test]
 fn generated_types_stay_at_the_edges() {
-    // Those that speak gRPC, and those that make messages of what they hold; nobody keeps a message as its state.
+    // Those that speak gRPC, and those that make messages of what they hold; none keeps a message as its state.
     let edges = [
         "actor/src/losses.rs",
         "actor/src/rollout.rs",
@@ -196,7 +196,7 @@ fn only_shared_memory_is_unsafe() {
 
 #[test]
 fn what_lies_in_a_run_directory_is_opened_as_a_regular_file() {
-    // Whatever lies in the place of a file, a pipe or a device, nobody waits at it.
+    // Whatever lies in the place of a file, a pipe or a device, no command waits at it.
     let ways = [
         "fs::read(",
         "fs::read_to_string(",

@@ -31,7 +31,7 @@ fn forged_frames_are_counted_and_never_reach_replay() {
     let mut sender = EpisodeSender::open(&space, layout.len(), Duration::from_secs(5)).unwrap();
     let mut send = |frame: &Frame| sender.send(frame, &|| false).unwrap();
 
-    // Not a frame at all; a whole episode that nobody handed out; the same with one bit changed.
+    // Not a frame at all; a whole episode that was never handed out; the same with one bit changed.
     send(&Frame::new(&layout));
     let tasks = TaskSet::MatrixGame.tasks(Split::Training);
     let mut rollout = Rollout::new(tasks, Arc::new(Embedded::default()), RunSeed(9), true);

@@ -254,7 +254,7 @@ fn a_slow_link_changes_nothing() {
     actors.into_iter().for_each(Actor::finish);
 }
 
-/// A run whose learner listens on loopback for whoever has the token; and the token's file.
+/// A run whose learner listens on loopback for those that have the token; and the token's file.
 fn on_loopback(folder: &RunFolder) -> (common::Train, String) {
     let token = folder.secret("token").display().to_string();
     let token_file = format!("learner.token_file={token}");

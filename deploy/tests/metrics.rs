@@ -113,7 +113,7 @@ async fn a_status_accounts_for_everything() {
     // Somebody always waits: two actors are more than this learner needs, or fewer.
     let waited: f64 = status.actors.iter().map(|actor| actor.waiting_s).sum();
     assert!(waited + status.learner_waiting_s > 0.0);
-    // A pause is nobody's waiting.
+    // A pause counts as no one's waiting.
     let later = control.status(StatusRequest {}).await.unwrap().into_inner();
     assert_eq!(later.learner_waiting_s, status.learner_waiting_s);
     for (then, now) in status.actors.iter().zip(&later.actors) {

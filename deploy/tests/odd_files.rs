@@ -1,4 +1,4 @@
-//! A named pipe in the place of a run's file: nobody waits at it.
+//! A named pipe in the place of a run's file: no command waits at it.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "helpers of tests are tests too")]
 
 mod common;

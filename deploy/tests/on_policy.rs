@@ -1,4 +1,4 @@
-//! MAPPO and MAT in the service: whoever rolls and whatever is killed, the same seed gives the same weights.
+//! MAPPO and MAT in the service: whichever actor rolls and whatever is killed, the same seed gives the same weights.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "helpers of tests are tests too")]
 
 mod common;

@@ -1,4 +1,4 @@
-//! Output that cannot be written: nobody reads it any more, or the disk is full. A run goes on; other commands end, and
+//! Output that cannot be written: its reader has gone, or the disk is full. A run goes on; other commands end, and
 //! nothing panics.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "helpers of tests are tests too")]
 
@@ -103,7 +103,7 @@ fn commands_end_quietly_on_a_closed_pipe_and_with_one_line_on_a_full_disk() {
         assert_eq!(mute.code(), Some(1), "{arguments:?}");
     }
     let mute = rit(&["train", "matrx-game"]).stderr(full()).status().unwrap();
-    assert_eq!(mute.code(), Some(2), "what was typed wrong is wrong whoever hears of it");
+    assert_eq!(mute.code(), Some(2), "what was typed wrong is wrong without a reader, too");
     let certificates = folder.path().join("certificates");
     let arguments = ["certificates", "--out", certificates.to_str().unwrap(), "--host", "localhost"];
     assert_eq!(rit(&arguments).stdout(closed_pipe()).status().unwrap().code(), Some(0));
@@ -162,7 +162,7 @@ fn a_run_goes_on_beside_a_pipe_that_is_full_and_that_nobody_reads() {
     let (reader, mut writer) = std::io::pipe().unwrap();
     rustix::io::ioctl_fionbio(&writer, true).unwrap();
     while writer.write(&[b'.'; 4096]).is_ok() {}
-    // Whoever writes waits from now on.
+    // Writers wait from now on.
     rustix::io::ioctl_fionbio(&writer, false).unwrap();
     let folder = RunFolder::new();
     assert_eq!(train(&folder, Stdio::null(), writer.into()), Some(0));

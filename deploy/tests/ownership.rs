@@ -1,4 +1,4 @@
-//! Whose a run is: one writer at a time, nothing removed that is not its own, nobody in another's way.
+//! Whose a run is: one writer at a time, nothing removed that is not its own, no run in another's way.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "helpers of tests are tests too")]
 
 mod common;
@@ -160,7 +160,7 @@ fn copies_of_a_live_run_are_runs_of_their_own() {
     assert!(train.ctl(&["checkpoint"]).status.success());
     let copies = ["first", "second"].map(|name| folder.path().join(name));
     copies.iter().for_each(|to| copy(&folder.run_dir(), to));
-    // A copy that was not resumed leads to nobody's learner.
+    // A copy that was not resumed leads to no learner.
     let status = output(&["ctl", "--run", copies[0].to_str().unwrap(), "status"]);
     assert!(!status.status.success(), "{}", String::from_utf8_lossy(&status.stdout));
     assert!(train.ctl(&["resume"]).status.success());
@@ -285,7 +285,7 @@ fn files_of_other_users_are_in_nobodys_way() {
 fn a_program_that_is_replaced_or_removed_goes_on() {
     let folder = RunFolder::new();
     let program = folder.path().join("rit");
-    // By another process: a program cannot be started while anybody has it open to write.
+    // By another process: a program cannot be started while a process has it open to write.
     copy(Path::new(env!("CARGO_BIN_EXE_rit")), &program);
     let mut train = folder.start_as(Command::new(&program), &long());
     replace_actor(&mut train);
@@ -368,7 +368,7 @@ fn what_is_wrong_with_a_run_directory_is_said() {
         refused(&["train", "matrix-game", "--run-dir", &path(resumed)], &[words]);
     }
     refused(&["train", "matrix-game", "--run-dir", &path("full")], &["thesis.tex lies there"]);
-    // A folder that was deleted under whoever stands in it.
+    // A folder that was deleted under the process that stands in it.
     let gone = path("deleted");
     let script = format!("cd {gone} && rmdir {gone} && exec \"$0\" \"$@\"");
     for arguments in [&["train", "matrix-game"][..], &["train", "--resume", "run"]] {

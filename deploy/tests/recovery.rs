@@ -98,7 +98,7 @@ fn a_killed_actor_is_restarted() {
     nothing_was_lost(&folder, &train.finish());
 }
 
-/// Whoever is told to leave does so in order, and its own slot is filled again.
+/// An actor that is told to leave does so gracefully, and its own slot is filled again.
 #[test]
 fn an_actor_that_is_told_to_leave_is_replaced() {
     let folder = RunFolder::new();
@@ -130,7 +130,7 @@ fn a_killed_learner_is_restarted_from_its_newest_checkpoint_and_actors_find_it()
     let folder = RunFolder::new();
     let mut train = folder.start(&[RUN, &["--actors", "2"]].concat());
     let mut actors = None;
-    // Before the first checkpoint, and behind others.
+    // Before the first checkpoint, and after others.
     for env_steps in [20, 200, 500] {
         let status = train.wait_for("progress", |status| status["env_steps"].as_u64() >= Some(env_steps));
         kill(learner_pid(&status), Signal::KILL);
@@ -257,7 +257,7 @@ fn torn_metrics_are_repaired_at_the_last_whole_line_and_it_is_said() {
     let run_dir = folder.run_dir();
     let path = run_dir.join("metrics.jsonl");
     let whole = fs::read_to_string(&path).unwrap();
-    // The evaluation at the end lies behind the checkpoint, which knows nothing of it.
+    // The evaluation at the end lies after the checkpoint, which knows nothing of it.
     let lines = whole.split_inclusive('\n').filter(|line| !line.contains("\"occasion\""));
     let lines: Vec<&str> = lines.collect();
     assert!(lines.len() > 2, "{whole}");
@@ -272,7 +272,7 @@ fn torn_metrics_are_repaired_at_the_last_whole_line_and_it_is_said() {
     let stderr = String::from_utf8_lossy(&resumed.stderr);
     assert!(resumed.status.success(), "{stderr}");
     for said in
-        ["lines are missing, it goes on behind its last whole one", "it is cut behind its last whole one"]
+        ["lines are missing, it goes on after its last whole one", "it is cut after its last whole one"]
     {
         assert!(stderr.contains(said), "{stderr}");
     }
@@ -284,7 +284,7 @@ fn torn_metrics_are_repaired_at_the_last_whole_line_and_it_is_said() {
     assert!(metrics(&folder).iter().eq(kept), "every other line is there once");
     assert_eq!(tensorboard_events(&folder), points(undisturbed) - 1);
 
-    // Nor is it silent where nothing is left to be done, and the learner ends before anybody asks it.
+    // Nor is it silent where nothing is left to be done, and the learner ends before it is asked.
     fs::write(&path, "").unwrap();
     let resumed = output(&["train", "--resume", run_dir.to_str().unwrap()]);
     let stderr = String::from_utf8_lossy(&resumed.stderr);

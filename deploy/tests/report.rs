@@ -91,7 +91,7 @@ fn shapley(folder: &RunFolder, run: &str) {
         (&found["agents"], &found["steps"], &found["rolled_steps"]),
         (&3.into(), &50.into(), &2.into())
     );
-    // Shapley values sum to what the whole team has above nobody, by definition.
+    // Shapley values sum to what the whole team has above the empty team, by definition.
     assert!(found["efficiency"][0]["mean_error"].as_f64().unwrap() < 1e-4, "{found}");
     assert_eq!(found["estimates"].as_array().unwrap().len(), 4, "M = 1, 2, 4 and all 6 orders");
     roxmltree::Document::parse(&fs::read_to_string(&figure).unwrap()).unwrap();

@@ -1,4 +1,4 @@
-//! UPDeT, REFIL and ROMA in the service: whoever rolls, the same seed gives the same weights, and what they measure is told.
+//! UPDeT, REFIL and ROMA in the service: whichever actor rolls, the same seed gives the same weights, and what they measure is told.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout, reason = "helpers of tests are tests too")]
 
 mod common;

@@ -80,7 +80,7 @@ fn games(game: &Path) -> Vec<(u32, u32)> {
         let is_ours = line.contains("starcraft-endpoint") && line.split('\0').any(|word| word == data);
         let status = fs::read_to_string(format!("/proc/{pid}/status")).ok().filter(|_| is_ours)?;
         let parent = status.lines().find_map(|line| line.strip_prefix("PPid:"))?.trim().parse().ok()?;
-        // A zombie's command line is empty, so whoever is listed lives.
+        // A zombie's command line is empty, so those that are listed live.
         Some((pid, parent))
     };
     pids.filter_map(game).collect()

@@ -80,7 +80,7 @@ fn a_run_that_is_over_is_shown_as_what_it_came_to() {
     );
 }
 
-/// A pseudo-terminal of the usual size: whoever sits at it, and what a process gets.
+/// A pseudo-terminal of the usual size: the user's side, and the process's side.
 fn terminal() -> (File, File) {
     let controller = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
     grantpt(&controller).unwrap();
@@ -106,7 +106,7 @@ fn on_a_terminal_it_draws_and_q_or_ctrl_c_ends_the_view_alone() {
         // It would hold the terminal open beyond the process's end.
         drop(command);
         let (mut shown, mut buffer, mut asked) = (Vec::new(), [0; 4096], false);
-        // A terminal that nobody has open any more cannot be read.
+        // A terminal that no process has open any more cannot be read.
         while let Ok(read) = controller.read(&mut buffer) {
             shown.extend_from_slice(&buffer[..read]);
             // One word: blanks are not drawn.

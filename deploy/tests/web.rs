@@ -253,7 +253,7 @@ fn a_page_goes_on_where_it_left_off_until_another_learner_serves_it() {
         status["ledger"]["outstanding"] == 0 && status["ledger"]["inserted"] == status["episodes"]
     });
 
-    // Some lines are known, named by the learner and the bytes read; it goes on behind them.
+    // Some lines are known, named by the learner and the bytes read; it goes on after them.
     let (_, id, _) = server.events_until("status", "");
     assert_eq!(id, "");
     let metrics = std::fs::read_to_string(folder.run_dir().join("metrics.jsonl")).unwrap();

@@ -18,7 +18,7 @@ pub struct AppendFile {
 }
 
 impl AppendFile {
-    /// Goes on behind the first `len` bytes of a file opened for writing; what lies behind them is cut off.
+    /// Goes on after the first `len` bytes of a file opened for writing; what comes after them is cut off.
     ///
     /// # Errors
     /// When it cannot be cut.
@@ -33,7 +33,7 @@ impl AppendFile {
         self.len
     }
 
-    /// Writes a record at once, so that whoever follows the file sees it whole. What the disk refuses is kept and
+    /// Writes a record at once, so that followers of the file see it whole. What the disk refuses is kept and
     /// written with the next one: training does not end for want of its record.
     pub fn append(&mut self, record: &[u8]) {
         let was_refused = !self.waiting.is_empty();

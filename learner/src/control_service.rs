@@ -54,7 +54,7 @@ impl MetricsReader {
                     }
                 }
                 _ = ticks.tick(), if status_every.is_some() => {
-                    // A run that is ending answers no more; a reader that is behind misses this one.
+                    // A run that is ending answers no more; a reader that is too slow misses this one.
                     if let Ok(status) = self.service.run.ask(Control::Status).await {
                         let _ = self.to.try_send(Ok(update(v1::metrics_update::Update::Status(status))));
                     }

@@ -2,7 +2,7 @@
 //!
 //! A state machine that owns the ledger and the list of actors: it is told what happened and at what time, and answers
 //! with what is to be done. Channels, clocks and connections are its [`Shell`]'s, which everybody else sends
-//! [`Event`]s. It never waits for the trainer or for an actor, so a slow one holds up nobody. `rit soak --simulated`
+//! [`Event`]s. It never waits for the trainer or for an actor, so a slow one holds up no other. `rit soak --simulated`
 //! drives this very code.
 
 mod control;
@@ -189,7 +189,7 @@ impl Coordinator {
         self.ledger.counts()
     }
 
-    /// Who waits for whom. Nobody does while the run is paused or ending.
+    /// Who waits for whom. No one does while the run is paused or ending.
     fn time_waits(&mut self) {
         let (now, running) = (self.now, self.state == State::Running);
         self.learner_waiting.set(running && self.batches_in_training == 0, now);
@@ -201,7 +201,7 @@ impl Coordinator {
     fn look(&mut self, effects: &mut Vec<Effect>) {
         let late = self.now.saturating_sub(self.looked);
         if late > LATE_LOOK {
-            // This process stood still: nobody is silent who could not be heard.
+            // This process stood still: an actor that could not be heard is not silent.
             let shift = late - LOOK_EVERY;
             self.actors.values_mut().for_each(|actor| actor.heard += shift);
             self.moved_at += shift;
@@ -372,7 +372,7 @@ impl Coordinator {
     fn insert(&mut self, id: ActorId, episode: Episode, effects: &mut Vec<Effect>) {
         if let Err(refused) = self.ledger.insert(id, episode) {
             // A late frame of an actor that was given up: its episode is rolled by another.
-            tracing::debug!(%refused, "a frame nobody waits for");
+            tracing::debug!(%refused, "a frame that the ledger does not wait for");
             *self.frames_refused.entry("not_outstanding").or_default() += 1;
             return;
         }

@@ -66,7 +66,7 @@ impl Evaluator {
         }
     }
 
-    /// Greedy episodes of a task where nobody asks for another number: `evaluation.testing_episodes` of a testing task,
+    /// Greedy episodes of a task where no other number is asked for: `evaluation.testing_episodes` of a testing task,
     /// `evaluation.episodes` of the others.
     pub fn own_episodes(&self, task: Task) -> usize {
         let is_testing = self.tasks[1].contains(&task);
@@ -116,11 +116,11 @@ impl Evaluator {
         asked: Option<usize>,
         seed: RunSeed,
     ) -> Result<Vec<TaskResult>, LostEpisode> {
-        // Nobody gives it up.
+        // It is never given up.
         self.evaluate_unless(policies, tasks, asked, seed, &|| false).map(Option::unwrap_or_default)
     }
 
-    /// [`Self::evaluate`], given up within a few episodes once nobody wants it any more: then `None`.
+    /// [`Self::evaluate`], given up within a few episodes once it is no longer wanted: then `None`.
     ///
     /// # Errors
     /// When environments fail again and again.
@@ -185,7 +185,7 @@ impl Evaluator {
         Rollout::new(vec![task], Arc::clone(&self.factory), seed, self.random_permutation)
     }
 
-    /// Rolls parts of the work until there is none, or nobody wants it any more: then it is `over` for all.
+    /// Rolls parts of the work until there is none, or it is no longer wanted: then it is `over` for all.
     fn roll_parts(
         &self,
         policy: &mut dyn Policy,

@@ -1,7 +1,7 @@
 //! The episode ledger: who rolls which episode with which weights, and in which order episodes enter replay.
 //!
 //! Episode i belongs to batch i / `n_rollout_threads`. A batch may be rolled once its *terms* are known: the
-//! weights version and the ε that a fixed number of updates (`policy_lag`) behind it left. Batches are
+//! weights version and the ε that a fixed number of updates (`policy_lag`) earlier left. Batches are
 //! released to training in order of number, each whole. So what training sees does not depend on which actor
 //! rolled what, on how many there are, or on which of them died.
 //!
@@ -61,7 +61,7 @@ impl Reason {
     }
 }
 
-/// An episode that nobody waits for from this actor: a late one of an actor given up, or a forged one.
+/// An episode that is not awaited from this actor: a late one of an actor given up, or a forged one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("episode {number} with weights {weights_version} is not outstanding with actor {actor}")]
 pub struct NotOutstanding {
@@ -312,7 +312,7 @@ mod tests {
         ledger.lease(1, 3);
         ledger.lease(2, 1);
         let reason = Reason::Environment(FailureKind::Died);
-        // Another actor's, and one that nobody has, stay where they are.
+        // Another actor's, and one that no actor has, stay where they are.
         assert_eq!(ledger.take_back_some(1, &[0, 2, 2, 3, 9], reason), 2);
         assert_eq!(ledger.lease(1, 9).unwrap().episodes, [0, 2]);
         let counts = ledger.counts();

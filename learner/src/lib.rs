@@ -1,4 +1,4 @@
-//! The learner: receives episodes, updates the weights, and serves whoever asks.
+//! The learner: receives episodes, updates the weights, and answers questions and commands.
 //!
 //! Four threads and a runtime. [`receive`] reads shared memory; [`trainer`] owns replay and weights; [`writer`]
 //! writes replay and checkpoints; a [`Learner`](rit_algo::Learner)'s own threads work on batches. On the runtime,

@@ -1,5 +1,5 @@
 //! One life of a run, from a learner's start to its end, and its place for shared memory: a fresh one for each, whose
-//! name nobody guesses, written into the run directory so that actors find it.
+//! name cannot be guessed, written into the run directory so that actors find it.
 
 use rit_config::{RunDir, read_text};
 use rit_ipc::{FreshError, RunSpace};
@@ -65,7 +65,7 @@ pub fn begin(run_dir: &RunDir) -> Result<(RunSpace, Option<String>), LifeError> 
     }
 }
 
-/// Removes the place that the run directory names, unless its learner lives. For whoever has the run's lock.
+/// Removes the place that the run directory names, unless its learner lives. For the process that has the run's lock.
 pub fn remove_dead(run_dir: &RunDir) {
     let file = run_dir.shared_memory();
     let Ok(directory) = read_text(&file) else { return };
@@ -78,7 +78,7 @@ pub fn remove_dead(run_dir: &RunDir) {
         .map_err(|error| error.to_string())
         .and_then(|space| space.remove_if_dead().map_err(|error| error.to_string()));
     match removed {
-        // Without the file nobody looks for it any more.
+        // Without the file no actor looks for it any more.
         Ok(true) => {
             let _ = fs::remove_file(file);
         }

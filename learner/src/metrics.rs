@@ -1,4 +1,4 @@
-//! What is measured while training: `metrics.jsonl`, one object a line, whoever follows it, and how episodes went
+//! What is measured while training: `metrics.jsonl`, one object a line, its readers, and how episodes went
 //! of late.
 
 use crate::{
@@ -20,7 +20,7 @@ use tokio::sync::watch;
 /// Episodes of each task that count as of late.
 pub const RECENT: usize = 100;
 
-/// Bytes that whoever follows the file reads at a time: far more than a line has.
+/// Bytes that a follower of the file reads at a time: far more than a line has.
 const CHUNK: u64 = 1 << 20;
 
 /// How exploring episodes of each training task went of late.
@@ -99,7 +99,7 @@ impl Recent {
 pub struct MetricsFile {
     path: PathBuf,
     file: AppendFile,
-    /// Bytes written, as whoever follows the file knows them.
+    /// Bytes written, as followers of the file know them.
     len: watch::Sender<u64>,
     started: Instant,
     /// Seconds that learners before this one ran.
@@ -107,7 +107,7 @@ pub struct MetricsFile {
 }
 
 impl MetricsFile {
-    /// Begins the file, or goes on behind the `end` that a checkpoint remembers: what lies behind it was written by a
+    /// Begins the file, or goes on after the `end` that a checkpoint remembers: what comes after it was written by a
     /// learner that died, and will be written again. `before_s` are the seconds that learners ran before. Returns what
     /// somebody should know of it too, if it had to be repaired.
     ///
@@ -173,7 +173,7 @@ impl MetricsFile {
     }
 }
 
-/// Reads `metrics.jsonl` while it is written. However slow it is, it holds up nobody and misses nothing: what it
+/// Reads `metrics.jsonl` while it is written. However slow it is, it holds up no other and misses nothing: what it
 /// has not read lies in the file.
 #[derive(Clone, Debug)]
 pub struct Follower {
@@ -211,7 +211,7 @@ impl Follower {
         self.at = at;
     }
 
-    /// Waits for further lines; `false` when there will be none, since nobody writes any more.
+    /// Waits for further lines; `false` when there will be none, since the writer has gone.
     pub async fn more(&mut self) -> bool {
         self.len.changed().await.is_ok()
     }

@@ -35,7 +35,7 @@ pub struct End {
 #[derive(Deserialize)]
 struct Any {
     env_steps: u64,
-    /// Of an evaluation that was not due: it was made at a run's end, behind the last checkpoint.
+    /// Of an evaluation that was not due: it was made at a run's end, after the last checkpoint.
     occasion: Option<IgnoredAny>,
 }
 
@@ -66,7 +66,7 @@ impl Lines {
     fn read(path: &Path, header: &Header, until_env_steps: u64) -> Result<Self, MetricsError> {
         let mut reader = BufReader::new(open_regular(path, OpenOptions::new().read(true))?);
         let (mut lines, mut line, mut at) = (Self::default(), Vec::new(), 0);
-        // Broken lines behind the last whole one are no hole among them.
+        // Broken lines after the last whole one are no hole among them.
         let mut broken_since = 0;
         loop {
             line.clear();
@@ -102,8 +102,8 @@ impl Lines {
     }
 }
 
-/// Cuts the file behind its last whole line up to the end, and takes lines out that cannot be read. Returns how long
-/// it is then, and what somebody should know of it.
+/// Cuts the file after its last whole line up to the end, and takes lines out that cannot be read. Returns how long
+/// it is then, and what a person should know of it.
 ///
 /// # Errors
 /// When it is of another run or build, or the system refuses.
@@ -115,7 +115,7 @@ pub fn repair(path: &Path, header: &Header, end: End) -> Result<(u64, Option<Str
         ));
     }
     let mut lines = Lines::read(path, header, end.env_steps)?;
-    // The header and the first line behind it are one range.
+    // The header and the first line after it are one range.
     lines.whole.dedup_by(|next, last| {
         let joined = last.end == next.start;
         if joined {
@@ -138,7 +138,7 @@ pub fn repair(path: &Path, header: &Header, end: End) -> Result<(u64, Option<Str
     let warning = (len != end.len).then(|| {
         format!(
             "{path_shown} ends at {last} steps where the checkpoint at {} steps remembers more: lines are missing, it \
-             goes on behind its last whole one",
+             goes on after its last whole one",
             end.env_steps
         )
     });
@@ -176,7 +176,7 @@ mod tests {
         format!("{{\"kind\":\"evaluation\",\"env_steps\":{env_steps},\"td_loss\":null}}\n")
     }
 
-    /// Header and lines at 0, 10 and 20 steps, whose checkpoint was written behind the last; then one at 30.
+    /// Header and lines at 0, 10 and 20 steps, whose checkpoint was written after the last; then one at 30.
     fn whole() -> String {
         format!("{RUN}\n{}{}{}{}", line(0), line(10), line(20), line(30))
     }
@@ -210,7 +210,7 @@ mod tests {
         assert_eq!(
             repaired(&whole()[..whole().len() - 5]),
             (kept.to_owned(), None),
-            "torn behind the checkpoint"
+            "torn after the checkpoint"
         );
         assert_eq!(repaired(kept), (kept.to_owned(), None));
     }
@@ -248,7 +248,7 @@ mod tests {
         let glued = whole().replace(&line(10), &line(10)[..20]);
         let (left, warning) = repaired(&glued);
         assert_eq!(left, format!("{RUN}\n{}", line(0)), "the glued one is both");
-        assert!(warning.unwrap().contains("lines are missing"), "nothing whole lies behind it");
+        assert!(warning.unwrap().contains("lines are missing"), "nothing whole comes after it");
         let zeros = whole().replace(&line(10), "\0\0\0\n");
         let (left, warning) = repaired(&zeros);
         assert_eq!(left, format!("{RUN}\n{}{}", line(0), line(20)));

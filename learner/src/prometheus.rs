@@ -133,7 +133,7 @@ fn tasks(status: &RunStatus) -> Vec<Family<'_>> {
             Some(r.mean_return)
         }),
         recent(Gauge, "exploring_win_rate", "Share of exploring episodes of late that won", |r| r.win_rate),
-        recent(Gauge, "policy_lag_updates", "Updates that the newest episode's weights lagged behind", |r| {
+        recent(Gauge, "policy_lag_updates", "Updates made since the newest episode's weights", |r| {
             r.policy_lag.map(|lag| lag as f64)
         }),
     ];
@@ -275,7 +275,7 @@ mod tests {
         while let Some(line) = lines.next() {
             let words: Vec<&str> = line.splitn(4, ' ').collect();
             match words[..] {
-                ["#", "EOF"] => assert_eq!(lines.peek(), None, "nothing behind the end"),
+                ["#", "EOF"] => assert_eq!(lines.peek(), None, "nothing after the end"),
                 ["#", "HELP", _, help] => assert!(!help.is_empty()),
                 ["#", "TYPE", name, kind] => {
                     assert!(types.insert(name.to_owned(), kind.to_owned()).is_none(), "{name} once");

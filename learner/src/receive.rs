@@ -40,7 +40,7 @@ pub fn read(header: Result<Header, Rejection>, payload: &[u8], expected: &Expect
     }
 }
 
-/// Receives until `stop` is set or nobody listens any more. A place that somebody has taken away is replaced by that of
+/// Receives until `stop` is set or its events have no receiver any more. A place that has been taken away is replaced by that of
 /// the receiver that `renew` makes; [`Event::PlaceLost`] lets actors join again, there.
 ///
 /// # Errors
@@ -73,7 +73,7 @@ pub fn receive(
 
 /// Why receiving ends.
 enum End {
-    /// Nobody wants more.
+    /// No more is wanted.
     Over,
     /// The place is not there any more.
     PlaceLost,

@@ -4,7 +4,7 @@ use rand::seq::index;
 use rit_episode::{Episode, Rng};
 use std::{collections::VecDeque, sync::Arc};
 
-/// The last episodes, oldest first, real rows only. Whoever writes them to disk shares them.
+/// The last episodes, oldest first, real rows only. The thread that writes them to disk shares them.
 #[derive(Debug)]
 pub struct Replay {
     episodes: VecDeque<Arc<Episode>>,
@@ -17,7 +17,7 @@ impl Replay {
         Self { episodes: VecDeque::with_capacity(capacity), capacity }
     }
 
-    /// Puts an episode behind the others; the oldest goes when there is no room.
+    /// Puts an episode after the others; the oldest goes when there is no room.
     pub fn insert(&mut self, episode: Arc<Episode>) {
         if self.episodes.len() == self.capacity {
             self.episodes.pop_front();

@@ -2,7 +2,7 @@
 //!
 //! Files of a fixed number of frames, each frame of the run's one length, so an episode's place follows from its
 //! number. A checkpoint after N episodes needs the last `buffer_size` frames before N to be durable; what lies
-//! behind N was written by a learner that died, and is cut off.
+//! after N was written by a learner that died, and is cut off.
 
 use rit_config::open_regular;
 use rit_episode::{
@@ -79,7 +79,7 @@ pub struct ReplayLog {
 }
 
 impl ReplayLog {
-    /// Goes on behind episode `next` − 1: whatever lies behind it is cut off.
+    /// Goes on after episode `next` − 1: whatever comes after it is cut off.
     ///
     /// # Errors
     /// When the folder cannot be made or cut.
@@ -109,7 +109,7 @@ impl ReplayLog {
         Ok(log)
     }
 
-    /// Writes the next episode, or a later one: those between are nobody's any more, and their place stays empty. A
+    /// Writes the next episode, or a later one: those between are no longer wanted, and their place stays empty. A
     /// failed write leaves the log as it was.
     ///
     /// # Errors

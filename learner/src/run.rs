@@ -244,7 +244,7 @@ pub async fn run(
 
     stop.store(true, Ordering::Relaxed);
     drop(close);
-    // Whoever still holds a connection open then has had its time.
+    // Connections that are open even then have had their time.
     let closing = async {
         while let Some(served) = servers.join_next().await {
             if let Ok(Err(error)) = served {
@@ -333,7 +333,7 @@ async fn listen(run_dir: &RunDir, config: &Config) -> Result<Vec<(Incoming, Acce
     Ok(doors)
 }
 
-/// Tells whoever reads the run directory where the learner listens: renamed into place, so it is whole.
+/// Tells readers of the run directory where the learner listens: renamed into place, so it is whole.
 fn tell_address(run_dir: &RunDir, address: &Address) -> Result<(), LearnerError> {
     let path = match address {
         Address::Unix(_) => run_dir.address(),

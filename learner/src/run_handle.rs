@@ -33,7 +33,7 @@ pub type SetLog = Arc<dyn Fn(&str) -> Result<(), String> + Send + Sync>;
 /// Why a question has no answer.
 #[derive(Debug, thiserror::Error)]
 pub enum AskError {
-    /// Nobody is there to answer.
+    /// The learner's threads have gone.
     #[error("the run is over")]
     Over,
     /// No such task.
@@ -45,7 +45,7 @@ pub enum AskError {
     /// An environment could not go on.
     #[error(transparent)]
     Lost(#[from] LostEpisode),
-    /// More episodes than anybody would wait for.
+    /// More episodes than a person would wait for.
     #[error("{0} episodes of a task are too many: at most {EPISODES_MAX}")]
     Episodes(u32),
     /// A setting that cannot be.
@@ -91,7 +91,7 @@ pub struct RunHandle {
     set_log: SetLog,
     model: Arc<Model>,
     measures: &'static [Measure],
-    /// Worlds for whoever asks.
+    /// Worlds for evaluations that are asked for.
     factory: Arc<dyn EnvironmentFactory>,
     /// One caller's episodes at a time: training goes on beside them.
     rollouts: Arc<Semaphore>,
@@ -99,7 +99,7 @@ pub struct RunHandle {
     waiting: Arc<Semaphore>,
 }
 
-/// Whoever asked: gone when this is dropped.
+/// The caller: gone when this is dropped.
 struct Asking(Arc<AtomicBool>);
 
 impl Drop for Asking {
@@ -176,7 +176,7 @@ impl RunHandle {
         answered.await.map_err(|_| AskError::Over)
     }
 
-    /// Waits until nobody answers any more.
+    /// Waits until no more answers come.
     pub async fn over(&self) {
         self.events.closed().await;
     }
@@ -216,7 +216,7 @@ impl RunHandle {
                 tasks: results.iter().map(messages::task_result).collect(),
             }))
         });
-        // What was given up has nobody to answer to.
+        // What was given up has no caller to answer.
         evaluation.await??.ok_or(AskError::Over)
     }
 
@@ -239,7 +239,7 @@ impl RunHandle {
         .await?
     }
 
-    /// Rolls with the newest weights on a thread of its own. When whoever asked has gone, `work` is told by its last
+    /// Rolls with the newest weights on a thread of its own. When the caller has gone, `work` is told by its last
     /// argument to give up.
     async fn roll<T: Send + 'static>(
         &self,

@@ -2,9 +2,9 @@
 //!
 //! A file is a row of TFRecords: length (u64), its masked CRC-32C, data, the data's masked CRC-32C, all
 //! little-endian; the data is a protobuf `Event`. Each learner writes a file of its own. One that goes on from a
-//! checkpoint first cuts away what was written behind it, so that there is one point a step. Each file begins with a
+//! checkpoint first cuts away what was written after it, so that there is one point a step. Each file begins with a
 //! session's start: a TensorBoard that is running then forgets what it had seen from that step on; before it stands
-//! whose the file is. Files that end in part of a record are cut behind the last whole one.
+//! whose the file is. Files that end in part of a record are cut after the last whole one.
 
 use crate::append_file::AppendFile;
 use crc::{CRC_32_ISCSI, Crc};
@@ -49,7 +49,7 @@ pub struct EventFile {
 }
 
 impl EventFile {
-    /// Begins a file in this folder, behind what lay there at `position`. Files and records behind that were
+    /// Begins a file in this folder, after what lay there at `position`. Files and records after that were
     /// written by a learner that died, and will be written again: the first line to come has `from_env_steps` or
     /// more. Returns what somebody should know of too: files that had to be cut.
     ///
@@ -128,7 +128,7 @@ fn writer(run_dir: &RunDir) -> String {
     format!("rit {}, format {FORMAT_VERSION}, run {run_id}", env!("CARGO_PKG_VERSION"))
 }
 
-/// Cuts a file behind its last whole record, or where a checkpoint says that it ends; what is said if records are
+/// Cuts a file after its last whole record, or where a checkpoint says that it ends; what is said if records are
 /// missing there.
 fn cut(path: &Path, end: Option<u64>) -> io::Result<Option<String>> {
     let bytes = rit_config::read_regular(path, FILE_BYTES_MAX)?;
@@ -140,7 +140,7 @@ fn cut(path: &Path, end: Option<u64>) -> io::Result<Option<String>> {
     let warning = || {
         let path = path.display();
         format!(
-            "{path} ends in part of a record or too early: it is cut behind its last whole one; metrics.jsonl has the same numbers"
+            "{path} ends in part of a record or too early: it is cut after its last whole one; metrics.jsonl has the same numbers"
         )
     };
     Ok(((whole as u64) < wanted).then(warning))

@@ -202,7 +202,7 @@ impl Trainer {
         Ok(())
     }
 
-    /// Works until the run is over or nobody can ask any more, then writes checkpoint and summary.
+    /// Works until the run is over or the threads around it have failed, then writes checkpoint and summary.
     ///
     /// # Errors
     /// When a file cannot be written or the weights diverge.
@@ -232,7 +232,7 @@ impl Trainer {
             if let Some(ended) = self.over() {
                 return Ok(ended);
             }
-            // Nobody is left to ask: the threads around this one have failed.
+            // The threads around this one have failed.
             let Ok(work) = work.recv() else { return Ok(Ended::Failed) };
             match work {
                 Work::Batch(episodes) => {
@@ -253,7 +253,7 @@ impl Trainer {
                     let (done, written) = oneshot::channel();
                     let weights_digest = self.checkpoint(Some(done));
                     let progress = self.standing.progress;
-                    // Whoever asked may have gone.
+                    // The caller may have gone.
                     let _ = answer.send(Checkpointed { progress, weights_digest, written });
                 }
                 Work::Set(config) => {
@@ -407,7 +407,7 @@ impl Trainer {
             },
             snapshots: kept.iter().map(|snapshot| Snapshot::clone(snapshot)).collect(),
         };
-        // A writer that has gone drops `done`, which tells whoever waits.
+        // A writer that has gone drops `done`, which tells those that wait.
         self.writer.checkpoint(Box::new(state), done);
         weights_digest
     }

@@ -42,7 +42,7 @@ impl Snapshot {
 #[derive(Debug)]
 pub struct WeightsBoard {
     kept: Mutex<Kept>,
-    /// How many updates the oldest version that a lease can ask for is behind the newest.
+    /// How many updates the oldest version that a lease can ask for is older than the newest.
     policy_lag: usize,
 }
 
@@ -63,7 +63,7 @@ impl Kept {
 
 impl WeightsBoard {
     /// A board with its newest snapshot. The oldest version that a lease can ask for is `policy_lag` updates
-    /// behind the newest.
+    /// older than the newest.
     pub fn new(newest: Snapshot, policy_lag: usize) -> Self {
         let kept = Kept { older: VecDeque::new(), newest: Arc::new(newest) };
         Self { kept: Mutex::new(kept), policy_lag }

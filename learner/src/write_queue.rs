@@ -1,7 +1,7 @@
 //! What waits to be written. A disk may be slower than training for a while, or for ever: neither may fill the memory.
 //!
 //! One state waits at most. A newer one takes the place of an older that the writer has not begun with: it holds all
-//! that the older held, and whoever waited for the older is answered by it. Episodes wait in their order, at most
+//! that the older held, and those that waited for the older are answered by it. Episodes wait in their order, at most
 //! twice as many as replay holds; beyond that training waits for the disk. What is trained does not depend on any of
 //! it: only which checkpoints there are does.
 
@@ -37,7 +37,7 @@ struct Waiting {
     episodes: usize,
     /// Episodes that may wait.
     episodes_max: usize,
-    /// Nobody gives anything any more, or nobody takes it.
+    /// Nothing is given any more, or the writer is gone.
     closed: bool,
 }
 
@@ -76,7 +76,7 @@ pub fn write_queue(replay_episodes: usize) -> (WriteQueue, WriteQueueReader) {
 }
 
 impl WriteQueue {
-    /// Adds an episode, when there is room. Without a writer nobody takes it; checkpoints say so.
+    /// Adds an episode, when there is room. Without a writer it is dropped; checkpoints say so.
     pub fn episode(&self, episode: Arc<Episode>) {
         let mut waiting = self.0.lock();
         while waiting.episodes >= waiting.episodes_max && !waiting.closed {
@@ -89,7 +89,7 @@ impl WriteQueue {
         }
     }
 
-    /// Adds a state in place of one that waits. Without a writer the answer is dropped, which tells whoever waits.
+    /// Adds a state in place of one that waits. Without a writer the answer is dropped, which tells those that wait.
     pub fn checkpoint(&self, state: Box<TrainingState>, answer: Option<oneshot::Sender<Written>>) {
         let mut waiting = self.0.lock();
         if waiting.closed {
@@ -133,7 +133,7 @@ impl WriteQueueReader {
 impl Drop for WriteQueueReader {
     fn drop(&mut self) {
         let mut waiting = self.0.lock();
-        // Whoever waits for a state is told by this.
+        // Those that wait for a state are told by this.
         waiting.queue.clear();
         waiting.closed = true;
         self.0.changed.notify_all();

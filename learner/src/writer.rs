@@ -56,7 +56,7 @@ pub struct Writer {
 }
 
 impl Writer {
-    /// Writes until nobody gives it anything any more.
+    /// Writes until the queue's last sender has gone.
     pub fn run(mut self, queue: &WriteQueueReader) {
         let mut waiting: VecDeque<Arc<Episode>> = VecDeque::new();
         while let Some(next) = queue.next() {
@@ -80,10 +80,10 @@ impl Writer {
                     let written = written.map_err(|error| error.to_string());
                     let failed = written.as_ref().err().cloned();
                     let ended = CheckpointEnded { env_steps, duration, failed };
-                    // At the end of a run nobody counts any more.
+                    // At the end of a run the coordinator may have gone.
                     let _ = self.events.blocking_send(Event::CheckpointEnded(ended));
                     for answer in answers {
-                        // Whoever asked may have gone.
+                        // The caller may have gone.
                         let _ = answer.send(written.clone());
                     }
                 }

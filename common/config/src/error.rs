@@ -132,7 +132,7 @@ pub enum ConfigError {
         "environment.training_tasks names no task; name those to learn from, by which environment.python makes them"
     )]
     NoTrainingTasks,
-    /// Nobody has asked Python yet.
+    /// Python has not been asked yet.
     #[error(
         "environment.worlds says nothing of the tasks: `rit train` and `rit learner --new` ask environment.python for it"
     )]
@@ -224,9 +224,9 @@ pub enum ConfigError {
         /// The key.
         key: String,
     },
-    /// Nobody would roll episodes.
+    /// No actor would roll episodes.
     #[error(
-        "actors.count = 0 leaves the run nobody who rolls episodes; `rit ctl pause` lets it rest, and with actors.remote \
+        "actors.count = 0 leaves the run without an actor that rolls episodes; `rit ctl pause` lets it rest, and with actors.remote \
          actors on other hosts may do all of it"
     )]
     NoActors,

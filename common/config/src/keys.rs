@@ -57,7 +57,7 @@ pub fn read(key: &str, text: &str, defaults: &Table) -> Result<Value, ConfigErro
         Err(ConfigError::Kind { key, expected: expected(default), found })
     };
     match default {
-        // Whoever writes quotes in spite of the shell means none.
+        // Quotes that the shell has left are not meant.
         Value::String(_) => Ok(Value::String(unquoted(text).unwrap_or_else(|| text.to_owned()))),
         Value::Integer(_) => match count(text) {
             Ok(number) => Ok(Value::Integer(number as i64)),

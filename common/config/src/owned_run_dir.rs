@@ -22,8 +22,8 @@ use std::{
     path::{Path, PathBuf},
 };
 
-/// What a learner leaves in its run directory to be found by, and what this crate writes: files that are of no use
-/// to anybody else.
+/// What a learner leaves in its run directory to be found by, and what this crate writes: files that no other
+/// program can use.
 const FOUND_BY: [&str; 5] = ["address", "remote_address", "web", "learner.sock", "shared_memory"];
 
 /// A run directory under its lock: no other process writes to it until this value, and every child process that was
@@ -125,7 +125,7 @@ impl OwnedRunDir {
         Ok((Self { run_dir, lock: None, before, notices: Vec::new() }, config))
     }
 
-    /// The directory, to be read by anybody.
+    /// The directory, for readers.
     pub fn run_dir(&self) -> &RunDir {
         &self.run_dir
     }
@@ -135,7 +135,7 @@ impl OwnedRunDir {
         self.lock.as_ref().map(AsFd::as_fd)
     }
 
-    /// What whoever started the run has to be told.
+    /// What the person who started the run has to be told.
     pub fn notices(&self) -> &[String] {
         &self.notices
     }

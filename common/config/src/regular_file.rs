@@ -21,7 +21,7 @@ pub fn open_regular(path: &Path, options: &mut OpenOptions) -> io::Result<File> 
     // A pipe that has no other end is opened at once, and then seen for what it is. Regular files know no waiting.
     let opened = options.custom_flags(OFlags::NONBLOCK.bits() as i32).open(path);
     let file = match opened {
-        // A pipe to write to that nobody reads, or a socket.
+        // A pipe to write to that has no reader, or a socket.
         Err(error) if error.raw_os_error() == Some(rustix::io::Errno::NXIO.raw_os_error()) => {
             return Err(no_file());
         }

@@ -96,7 +96,7 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
     Ok(config)
 }
 
-/// `[starcraft]` as nobody has changed it.
+/// `[starcraft]` with its defaults.
 fn starcraft_default() -> Result<StarCraft, ConfigError> {
     let section = defaults()?.remove("starcraft").unwrap_or(Value::Table(Table::new()));
     section.try_into().map_err(|error| wrong_value(&error))

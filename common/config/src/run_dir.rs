@@ -150,7 +150,7 @@ impl RunDir {
         self.lineage
     }
 
-    /// The secret that whoever speaks to the run's learner must know.
+    /// The secret that programs must know that speak to the run's learner.
     pub fn token(&self) -> &str {
         &self.token
     }
@@ -286,7 +286,7 @@ pub(crate) fn read_config(root: &Path) -> Result<String, RunDirError> {
     })
 }
 
-/// Sixteen bytes that no other run has and nobody guesses.
+/// Sixteen bytes that no other run has and that cannot be guessed.
 pub(crate) fn random_bytes() -> io::Result<RunId> {
     let mut bytes = RunId::default();
     // So few bytes come at once, or not at all.

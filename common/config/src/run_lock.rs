@@ -24,7 +24,7 @@ const ORPHANS_TIMEOUT: Duration = Duration::from_secs(15);
 /// From one look whether they have to the next.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
-/// A run's lock. Whoever writes to a run's directory has it, or was handed it by the process that started it.
+/// A run's lock. A process that writes to a run's directory has it, or was handed it by the process that started it.
 #[derive(Debug)]
 pub struct RunLock {
     locked: File,
@@ -63,7 +63,7 @@ impl RunLock {
         handed.is_some() && ours.contains(&handed) && matches!(try_lock(root), Ok(None))
     }
 
-    /// Says who has the lock, for the message to whoever wants it too.
+    /// Says who has the lock, for the message to the next process that wants it.
     pub(crate) fn tell_holder(root: &Path, is_first: bool) {
         let mut options = OpenOptions::new();
         options.create(true).mode(0o600);

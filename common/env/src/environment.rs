@@ -67,8 +67,8 @@ pub enum FailureKind {
     TimedOut,
     /// Its process or connection is gone.
     Died,
-    /// It answered something that no environment of its task may: a wrong shape, a number that is none, nobody who
-    /// may do anything.
+    /// It answered something that no environment of its task may: a wrong shape, a number that is none, an agent that may
+    /// do nothing.
     BadAnswer,
 }
 

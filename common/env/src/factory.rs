@@ -1,9 +1,9 @@
-//! Where worlds come from. Tasks of this crate are played in this process; what else there is, such as games behind
+//! Where worlds come from. Tasks of this crate are played in this process; all others, such as games across
 //! a network, is built above it.
 
 use crate::{Environment, EnvironmentError, EnvironmentOptions, Spec, Task};
 
-/// Makes the worlds of tasks. Whoever rolls episodes asks for a world when it has none that is idle, and again after
+/// Makes the worlds of tasks. A rollout asks for a world when it has none that is idle, and again after
 /// one has failed.
 pub trait EnvironmentFactory: Send + Sync {
     /// What a task is in these worlds, as data: nothing is built for it.
@@ -21,7 +21,7 @@ pub trait EnvironmentFactory: Send + Sync {
     /// No world is needed for a while: what those that have ended left running may end as well.
     fn rest(&self) {}
 
-    /// Most worlds that may play at once; embedded ones are as many as anybody likes.
+    /// Most worlds that may play at once; embedded ones are not limited.
     fn worlds_max(&self) -> usize {
         usize::MAX
     }

@@ -57,7 +57,7 @@ impl ForeignSet {
     }
 }
 
-/// The world of such a task where nobody makes one: it says so.
+/// The world of such a task where no factory makes one: it says so.
 #[derive(Debug)]
 pub(crate) struct Nowhere(pub(crate) &'static ForeignTask);
 

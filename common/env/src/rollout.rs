@@ -341,7 +341,7 @@ mod tests {
     #[test]
     fn actions_are_mapped_back_through_the_decision_order() {
         // Game 1 is won by (a¹, a³) of the environment's agents. Rows play (a¹, a³), so it is won exactly
-        // when agent 0 decides first; game 4 is won by (a¹, a¹), whoever is first.
+        // when agent 0 decides first; game 4 is won by (a¹, a¹) in either order.
         let jobs: Vec<Job> =
             (0..40).map(|number| Job { task: Some(0), ..jobs(number..number + 1)[0] }).collect();
         let episodes = all_rolled(rollout(5, true).roll(&mut Fixed([0, 2]), &jobs)).unwrap();

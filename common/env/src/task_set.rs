@@ -194,7 +194,7 @@ impl TaskSet {
         }
     }
 
-    /// Whether anybody flees in its tasks.
+    /// Whether its tasks have prey.
     pub fn has_prey(self) -> bool {
         match self {
             Self::PredatorPrey | Self::PredatorPreyPro => true,

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-/// Characters of a name that are repeated: whoever asks may be anybody.
+/// Characters of a name that are repeated: it may come from a stranger.
 const NAME_CHARS: usize = 64;
 
 /// A name that means nothing, with those that do.

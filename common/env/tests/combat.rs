@@ -82,7 +82,7 @@ fn randomly(turn: &mut Turn<'_>) {
     }
 }
 
-/// What both sides had and have not is what hits took, less what came back; nobody leaves the map; no NaN.
+/// What both sides had and have not is what hits took, less what came back; no unit leaves the map; no NaN.
 #[test]
 fn battles_keep_their_accounts() {
     for name in ["8m", "2s3z", "3m3M", "2m2M2v", "2s2z2c"] {

@@ -1,5 +1,5 @@
 //! What a worker and this program say to each other: frames over a byte stream. `deploy/docs/environments.md` describes them
-//! for whoever writes the other side; nothing that comes from there is trusted.
+//! for authors of the other side; nothing that comes from there is trusted.
 //!
 //! A frame is the length of its body (u32), its kind (u16) and the environment it is about (u16), all little-endian, then
 //! the body.

@@ -5,8 +5,8 @@
 //!   [`RunSpace::remove`] leaves nothing there.
 //! - [`EpisodeReceiver`] is the learner's end: it creates the place, waits without polling, and reads frames
 //!   where they lie.
-//! - [`EpisodeSender`] is an actor's end: one copy into shared memory, then it waits for as long as the learner
-//!   is behind. Nothing is overwritten and nothing is dropped silently.
+//! - [`EpisodeSender`] is an actor's end: one copy into shared memory, then it waits until the learner has
+//!   room again. Nothing is overwritten and nothing is dropped silently.
 //!
 //! ```no_run
 //! # use rit_episode::wire::Frame;

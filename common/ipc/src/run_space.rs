@@ -181,7 +181,7 @@ impl RunSpace {
     }
 
     /// Removes the places in this folder that dead lives have left, whatever became of the run directories that told of
-    /// them: those of this user, made more than an hour ago, whose learner's lock nobody holds. Returns which. What
+    /// them: those of this user, made more than an hour ago, whose learner's lock is free. Returns which. What
     /// cannot be looked at or removed stays.
     pub fn sweep(folder: &Path) -> Vec<PathBuf> {
         let mut removed = Vec::new();
@@ -342,7 +342,7 @@ mod tests {
     use std::fs::{self, File};
     use std::time::SystemTime;
 
-    /// Makes it look as if nobody had touched it for two hours.
+    /// Makes it look as if it had not been touched for two hours.
     fn age(directory: &Path) {
         let then = SystemTime::now() - 2 * ABANDONED_AFTER;
         File::open(directory).unwrap().set_modified(then).unwrap();

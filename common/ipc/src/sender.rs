@@ -71,7 +71,7 @@ pub enum OpenError {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SendError {
     /// The caller's `give_up` said so.
-    #[error("gave up sending a frame after {waited:.1?}: the learner is gone or behind")]
+    #[error("gave up sending a frame after {waited:.1?}: the learner is gone or too slow")]
     GaveUp {
         /// How long the learner was waited for.
         waited: Duration,
@@ -131,7 +131,7 @@ impl EpisodeSender {
             .allocation_strategy(AllocationStrategy::Static)
             .max_loaned_samples(1)
             // No more frames than the learner's queue holds. So the queue is never full when there is a frame to
-            // send, and being behind shows where it costs nothing: at the loan, before the copy.
+            // send, and a learner that is too slow shows where it costs nothing: at the loan, before the copy.
             .override_sample_preallocation(move |_| frames)
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .create()
@@ -156,7 +156,7 @@ impl EpisodeSender {
     }
 
     /// Copies a frame into shared memory and hands it to the learner. Waits while there is no learner, and while
-    /// the learner is behind by all of this sender's frames. `give_up` is asked at least every 5 ms of waiting,
+    /// the learner still has all of this sender's frames to read. `give_up` is asked at least every 5 ms of waiting,
     /// and not at all when there is nothing to wait for.
     ///
     /// `Ok` means that the frame is in a learner's queue. A learner that dies loses its queue, and a sender that

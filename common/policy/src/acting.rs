@@ -60,7 +60,7 @@ pub enum ActError {
         /// The most it takes.
         max: usize,
     },
-    /// What nobody can see.
+    /// An observation that cannot be.
     #[error("episode {episode}: {fault}")]
     Observation {
         /// Which episode.

@@ -1,4 +1,4 @@
-//! Trained policies, for whoever wants to act with one: a weights file says what model it holds ([`Weights`]), and
+//! Trained policies, for programs that act with one: a weights file says what model it holds ([`Weights`]), and
 //! [`TrainedPolicy`] is that model acting, for several episodes at once. No network and no learner is needed.
 //!
 //! ```no_run

@@ -1,4 +1,4 @@
-//! A trained policy acts as evaluation acts, to the last bit, whoever acts beside it.
+//! A trained policy acts as evaluation acts, to the last bit, whatever other episodes it acts in at the same time.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests too")]
 
 use rit_algo::{Acting, Method, Model};

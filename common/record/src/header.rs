@@ -17,7 +17,7 @@ pub fn is_header(line: &[u8]) -> bool {
     line.starts_with(BEGINNING)
 }
 
-/// The first line. The kind comes first, so that whoever reads lines can tell.
+/// The first line. The kind comes first, so that a reader of lines can tell.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Header {
     kind: String,

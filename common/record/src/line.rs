@@ -1,4 +1,4 @@
-//! The lines of `metrics.jsonl` behind its header.
+//! The lines of `metrics.jsonl` after its header.
 
 use crate::{Measured, TaskResult, number};
 use rit_env::Split;

@@ -8,7 +8,7 @@ use std::{fs, num::NonZero, thread, time::Duration};
 pub struct Build {
     /// Its version.
     pub version: String,
-    /// The commit it was built from, with `+` behind it if files had been changed; none where that is not known, such as
+    /// The commit it was built from, with `+` after it if files had been changed; none where that is not known, such as
     /// a debug build's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub commit: Option<String>,

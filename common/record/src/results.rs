@@ -142,7 +142,7 @@ impl TryFrom<InFile> for TaskResult {
 
     fn try_from(found: InFile) -> Result<Self, String> {
         let InFile { episodes, mean_return, win_rate, returns, lengths, wins, exploring } = found;
-        // Nobody rolls more, and a slip of the pen takes no memory.
+        // More are never rolled, and a slip of the pen takes no memory.
         let count = usize::try_from(episodes).ok().filter(|&count| count <= EPISODES_MAX);
         let each = match (returns, lengths, count) {
             (Some(returns), Some(lengths), Some(count)) => {

@@ -160,7 +160,7 @@ pub struct Best {
     pub progress: Progress,
     /// SHA-256 of its weights.
     pub weights_digest: String,
-    /// The absolute metric: ten times as many greedy episodes, by training task. Empty where nobody asked for it.
+    /// The absolute metric: ten times as many greedy episodes, by training task. Empty where it was not asked for.
     #[serde(default, deserialize_with = "named", skip_serializing_if = "BTreeMap::is_empty")]
     pub evaluation: BTreeMap<String, TaskResult>,
     /// The same of testing tasks.

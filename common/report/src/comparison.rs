@@ -334,7 +334,7 @@ fn is_whole(task_set: &str, training: &[String]) -> bool {
     all == training.iter().cloned().collect()
 }
 
-/// Tasks as the set lists them; others by their names, behind.
+/// Tasks as the set lists them; then others by their names.
 fn in_order(task_set: &str, split: Split, mut tasks: Vec<String>) -> Vec<String> {
     let listed: Vec<String> = task_set
         .parse::<TaskSet>()

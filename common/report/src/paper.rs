@@ -254,7 +254,7 @@ pub fn place(task_set: &str) -> usize {
     TaskSet::ALL.iter().position(|set| set.to_string() == task_set).unwrap_or(TaskSet::ALL.len())
 }
 
-/// A method's place by its label; variants lie behind what they vary, others last.
+/// A method's place by its label; variants follow what they vary, others come last.
 pub fn method_place(label: &str) -> usize {
     let name = label.split(' ').next().unwrap_or(label);
     let name = name.strip_suffix(NO_PERMUTATION).unwrap_or(name);

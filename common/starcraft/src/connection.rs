@@ -23,7 +23,7 @@ const SHOWN_MAX: usize = 300;
 /// What can go wrong between a client and a game.
 #[derive(Debug, thiserror::Error)]
 pub enum ConnectionError {
-    /// Nobody listens yet, or the API is not there yet: a game that starts up.
+    /// There is no listener yet, or the API is not there yet: a game that starts up.
     #[error("{address} does not answer yet: {reason}")]
     NotReady {
         /// Where.
@@ -123,7 +123,7 @@ impl Connection {
     /// Connects to the game that listens there; each answer is then waited for so long.
     ///
     /// # Errors
-    /// When nobody listens, or somebody else does.
+    /// When there is no listener, or another program listens.
     pub fn open(address: SocketAddr, timeout: Duration) -> Result<Self, ConnectionError> {
         const REQUEST: &str = "the handshake";
         let connecting = CONNECT_TIMEOUT.min(timeout);
@@ -227,7 +227,7 @@ impl Connection {
             }
             Error::Io(error) => ConnectionError::Closed { request, reason: error.to_string() },
             Error::ConnectionClosed | Error::AlreadyClosed => {
-                ConnectionError::Closed { request, reason: "nobody is there any more".into() }
+                ConnectionError::Closed { request, reason: "the other side has gone".into() }
             }
             Error::Protocol(tungstenite::error::ProtocolError::ResetWithoutClosingHandshake) => {
                 ConnectionError::Closed { request, reason: "it broke off".into() }

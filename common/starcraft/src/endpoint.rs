@@ -83,7 +83,7 @@ impl Endpoint {
         self.listener.local_addr()
     }
 
-    /// Plays with whoever connects, many at once, as long as it can listen.
+    /// Plays with every client that connects, many at once, as long as it can listen.
     ///
     /// # Errors
     /// When it cannot any more.

@@ -247,7 +247,7 @@ impl Game {
             let (side, kind) = match unit.owner() {
                 1 => (Side::Ally, self.custom.kind(unit.unit_type())),
                 2 => (Side::Enemy, standard_kind(unit.unit_type())),
-                // Nobody's: what the map is decorated with.
+                // Neither side's: what the map is decorated with.
                 _ => continue,
             };
             let kind =
@@ -306,7 +306,7 @@ impl Game {
         }
     }
 
-    /// Ends the game in order, and waits for its end.
+    /// Ends the game gracefully, and waits for its end.
     pub fn quit(mut self) {
         self.ask_to_quit();
         if let Some(process) = self.process.take() {

@@ -22,7 +22,7 @@ const DEFAULT_FOLDER: &str = "StarCraftII";
 /// A folder of `Versions`, before its build's number.
 const BASE: &str = "Base";
 
-/// A map's file, behind its name.
+/// What a map's file name ends with.
 const MAP_SUFFIX: &str = ".SC2Map";
 
 /// The game that is wanted.
@@ -51,7 +51,7 @@ pub enum InstallationError {
         /// Who says so.
         from: &'static str,
     },
-    /// Nobody says where it is.
+    /// It is said nowhere where it is.
     #[error("neither SC2PATH nor HOME says where StarCraft II is; set SC2PATH to its folder")]
     NoFolder,
     /// A folder without the game.

@@ -38,7 +38,7 @@ impl Starter {
         let (starts, queue) = mpsc::channel::<(Command, mpsc::Sender<io::Result<Child>>)>();
         thread::Builder::new().name("starcraft".into()).spawn(move || {
             while let Ok((mut command, answer)) = queue.recv() {
-                // Whoever asked waits for it.
+                // The caller waits for it.
                 let _ = answer.send(command.spawn());
             }
         })?;
@@ -145,7 +145,7 @@ fn output_file(folder: &Path) -> PathBuf {
     folder.join("output.log")
 }
 
-/// A port of this machine that nobody listens on now.
+/// A port of this machine without a listener.
 fn free_address() -> io::Result<SocketAddr> {
     TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?.local_addr()
 }

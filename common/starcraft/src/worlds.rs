@@ -43,7 +43,7 @@ pub struct Settings {
 enum Source {
     /// Processes that are started for it.
     Installed,
-    /// Whoever listens there gives one for each connection.
+    /// The program that listens there gives one for each connection.
     At(SocketAddr),
 }
 
@@ -80,7 +80,7 @@ impl Games {
             }
             match game.tell_to_begin() {
                 Ok(()) => return Ok(Coming::Ready(Box::new(game))),
-                // It died while nobody looked, which costs no episode.
+                // It died while it was idle, which costs no episode.
                 Err(error) => tracing::warn!(%error, "an idle game is gone"),
             }
         }
@@ -173,7 +173,7 @@ impl StarCraft {
         Self::of(Source::Installed, set, settings)
     }
 
-    /// In games that are there already: whoever listens at this address gives one for each connection.
+    /// In games that are there already: the program that listens at this address gives one for each connection.
     pub fn at(address: SocketAddr, set: CombatSet, settings: Settings) -> Self {
         Self::of(Source::At(address), set, settings)
     }

@@ -138,7 +138,7 @@ fn the_client_over_the_endpoint_gives_what_the_simulator_gives() {
                 let actions: Vec<Action> = (0..spec.n_agents)
                     .map(|agent| {
                         let available = ours.available_to(agent);
-                        // Whoever can shoot does so mostly; others wander, so that battles come about.
+                        // Units that can shoot do so mostly; others wander, so that battles come about.
                         let first = (6..available.len()).find(|&action| available[action] == 1);
                         let any: Vec<usize> = (0..available.len()).filter(|&a| available[a] == 1).collect();
                         let random = any[choices.random_range(0..any.len())];
@@ -200,7 +200,7 @@ fn custom_types_are_found_by_name_by_looks_or_by_setting() {
     assert!(error.contains("were not found") && error.contains("starcraft.custom_types"), "{error}");
 }
 
-/// Whoever says `control_enemy` each time takes the enemies out of control every second time; the client notices.
+/// A client that says `control_enemy` each time takes the enemies out of control every second time; the client notices.
 #[test]
 fn control_of_the_enemies_is_taken_back_when_it_was_toggled_away() {
     let set = CombatSet::Marines;
@@ -211,7 +211,7 @@ fn control_of_the_enemies_is_taken_back_when_it_was_toggled_away() {
             let rng = &mut SEED.stream(Stream::Environment, episode);
             world.begin_reset(rng).unwrap();
             world.reset(rng).unwrap();
-            // The enemies come: somebody is hit in the end, though nobody moves.
+            // The enemies come: a unit is hit in the end, though no ally moves.
             let mut end = None;
             while end.is_none() {
                 let mut observation = Observation::new(3, 6, 35, 14);

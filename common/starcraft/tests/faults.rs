@@ -41,7 +41,7 @@ const HANGS: Duration = Duration::from_secs(60);
 /// A deadline that a test waits for.
 const WAIT: Duration = Duration::from_millis(500);
 
-/// A server that does this with whoever connects.
+/// A server that does this with every client.
 fn server(serve: impl Fn(TcpStream) + Send + Sync + 'static) -> SocketAddr {
     let listener = TcpListener::bind(("127.0.0.1", 0)).unwrap();
     let address = listener.local_addr().unwrap();

@@ -165,7 +165,7 @@ pub struct ReportOptions {
 
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The page is served to this machine only, to whoever knows the token in its address; `ssh -L 8080:127.0.0.1:8080 HOST` leads \
+The page is served to this machine only, to those who know the token in its address; `ssh -L 8080:127.0.0.1:8080 HOST` leads \
 to it from another machine. Ctrl-C ends it.")]
 pub struct ServeOptions {
     /// Folder of runs, a sweep, or a run directory

@@ -51,7 +51,7 @@ pub enum CtlCommand {
         /// Go on with what is measured from now on, until the run is over
         #[arg(long)]
         follow: bool,
-        /// Begin with the first line at or behind so many environment steps
+        /// Begin with the first line at or after so many environment steps
         #[arg(long, value_name = "STEPS", default_value_t = 0, value_parser = count)]
         from: u64,
     },

@@ -4,7 +4,7 @@
 //! and all others the *default* action, the first that is available to them (in particle worlds standing still, in combat
 //! the no-op of the dead and stopping of the living, in matrix games a¹). Two games give it a worth:
 //! the *learned* one, Q_total of the joint action in the state, with the histories of the actions taken; and the
-//! environment's *own*, the return from that step on where the greedy team goes on behind it, with the episode's own
+//! environment's *own*, the return from that step on where the greedy team goes on after it, with the episode's own
 //! random streams. The paper defines values likewise (section V, equation 7), without saying what others do.
 
 use crate::{failure::Failure, player::Trained};

@@ -37,12 +37,12 @@ pub struct Dealt {
     pub recovery_s: f64,
 }
 
-/// Whether anybody reads what a `rit train` says.
+/// Whether what a `rit train` says is read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Output {
     /// A file beside the run's directory.
     Log,
-    /// Nobody: the other end of its pipes is closed.
+    /// It is not: the other end of its pipes is closed.
     Closed,
 }
 

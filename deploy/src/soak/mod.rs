@@ -74,7 +74,7 @@ pub async fn run(options: SoakOptions) -> Result<ExitCode, Failure> {
 
     let say = |words: &str| {
         if !options.json {
-            // The soak goes on for its end, whoever listens meanwhile.
+            // The soak goes on for its end, with or without a reader.
             let _ = output::say(words);
         }
     };

@@ -18,7 +18,7 @@ const BLOWS_PER_SUPERVISOR: usize = 3;
 pub enum Blow {
     /// An actor is killed.
     ActorKilled,
-    /// An actor is told to end, by SIGTERM: it leaves in order.
+    /// An actor is told to end, by SIGTERM: it leaves gracefully.
     ActorTold,
     /// Likewise, by SIGINT.
     ActorInterrupted,
@@ -34,7 +34,7 @@ pub enum Blow {
     LearnerHungUp,
     /// The learner is stopped: it is noticed by its silence.
     LearnerStopped,
-    /// The learner alone is told to end, in order: another goes on.
+    /// The learner alone is told to shut down gracefully: another goes on.
     LearnerTold,
     /// `rit train` is told to end; the run is resumed.
     TrainTold,
@@ -42,7 +42,7 @@ pub enum Blow {
     TrainHungUp,
     /// All processes at once, as when the machine loses power; the run is resumed.
     Everything,
-    /// `rit train` is told to end, and resumed with nobody who reads what it says.
+    /// `rit train` is told to end, and resumed without a reader of what it says.
     OutputClosed,
     /// Another learner is started for the run, and another `rit train --resume`: both are refused.
     SecondLearner,

@@ -3,7 +3,7 @@
 use super::INTERRUPTED;
 use std::fmt;
 
-/// A process of the run, by the place it holds. Whoever runs there, and however often it was started anew: the place
+/// A process of the run, by the place it holds. However often a process was started anew there, the place
 /// is its identity.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Place {
@@ -86,7 +86,7 @@ pub enum Event {
     Status(Standing),
     /// The learner was asked in vain, for this reason.
     NoAnswer(String),
-    /// Ctrl-C, SIGTERM or SIGHUP: the run shall end in order.
+    /// Ctrl-C, SIGTERM or SIGHUP: the run shall shut down gracefully.
     Interrupted,
     /// Time has passed.
     Tick,
@@ -97,15 +97,15 @@ pub enum Event {
 pub enum Effect {
     /// Start a process. There is none in its place.
     Start(Place),
-    /// Ask a process to end in order, by closing its lifeline.
+    /// Ask a process to shut down gracefully, by closing its lifeline.
     AskToEnd(Place),
     /// Kill a process.
     Kill(Place),
-    /// Ask the learner to end the run in order.
+    /// Ask the learner to end the run gracefully.
     StopRun,
     /// Remove what the run has in shared memory. None of its processes lives.
     RemoveSharedMemory,
-    /// Say something to whoever watches.
+    /// Say something on the terminal.
     Say(String),
     /// The run is over, and none of its processes lives.
     Over(Outcome),
@@ -116,7 +116,7 @@ pub enum Effect {
 pub enum Outcome {
     /// The learner says that it is done, or was asked to stop; `summary.json` says which.
     Finished,
-    /// It was interrupted, and ended in order.
+    /// It was interrupted, and ended gracefully.
     Interrupted,
     /// It failed.
     Failed {

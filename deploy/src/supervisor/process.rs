@@ -26,7 +26,7 @@ pub struct Processes<'a> {
 /// What can be done to a process.
 #[derive(Debug)]
 struct Handle {
-    /// The process's standard input: it ends in order when this is closed, however that comes about. Waiting for a
+    /// The process's standard input: it shuts down gracefully when this is closed, however that comes about. Waiting for a
     /// child closes the input it still holds, so it is held here.
     lifeline: Option<ChildStdin>,
     kill: Option<oneshot::Sender<()>>,
@@ -74,7 +74,7 @@ impl<'a> Processes<'a> {
         Ok(pid)
     }
 
-    /// Asks a process to end in order.
+    /// Asks a process to shut down gracefully.
     pub fn ask_to_end(&mut self, place: Place) {
         if let Some(handle) = self.handles.get_mut(&place) {
             handle.lifeline = None;
@@ -97,7 +97,7 @@ impl<'a> Processes<'a> {
                     self.handles.remove(&place);
                     return (place, exit(status));
                 }
-                // Nobody aborts these tasks, and they do not panic.
+                // These tasks are not aborted, and they do not panic.
                 Some(Err(error)) => tracing::error!(%error, "a process is not waited for any more"),
                 None => std::future::pending().await,
             }

@@ -240,7 +240,7 @@ async fn ask(mut control: ControlClient<Client>) -> Contacted {
 }
 
 fn standing(status: &RunStatus) -> Standing {
-    // The process of an actor on another host has a number that may be anybody's here.
+    // The process of an actor on another host has a number that may be another process's here.
     let hung = status.actors.iter().filter(|actor| actor.hung && !actor.remote);
     Standing {
         actors_wanted: status.actors_wanted,

@@ -142,7 +142,7 @@ impl World {
 fn an_actor_that_is_told_to_leave_is_replaced_in_its_own_slot() {
     for slot in 0..2 {
         let mut world = World::new(2);
-        // It ends in order on TERM and INT: exit code 0.
+        // It shuts down gracefully on TERM and INT: exit code 0.
         world.ends(Place::Actor(slot), Exit::Code(0));
         world.status();
         assert_eq!(world.actors(), [1 - slot], "the run may be ending");
@@ -158,7 +158,7 @@ fn counts_that_change_faster_than_actors_leave() {
     for wanted in [6, 1, 6, 2, 5, 4, 1, 3] {
         world.wanted = wanted;
         world.status();
-        // Whoever was asked to leave still rolls its episode.
+        // The actor that was asked to leave still rolls its episode.
         assert!(world.actors().iter().max() < Some(&6));
     }
     world.settle();
@@ -179,7 +179,7 @@ fn a_hung_actor_is_killed_once_and_replaced() {
 
 #[test]
 fn what_fails_for_six_seconds_ends_no_run() {
-    // Shared memory is full: whoever starts writes to it and dies at once.
+    // Shared memory is full: a process that starts writes to it and dies at once.
     let mut world = World::new(2);
     let begun = world.now;
     while world.now - begun < seconds(6) {
@@ -283,7 +283,7 @@ fn an_interrupt_ends_the_run_whatever_the_learner_is_doing() {
     let mut beginning = Supervisor::new(2, "logs".into());
     beginning.handle(Event::Begin, seconds(0));
     let said = beginning.handle(Event::Interrupted, seconds(1));
-    assert_eq!(said, [Effect::Say("interrupted: ending the run in order".into())]);
+    assert_eq!(said, [Effect::Say("interrupted: shutting the run down gracefully".into())]);
     assert_eq!(beginning.handle(Event::Answers, seconds(2)), [Effect::StopRun]);
 }
 
@@ -315,7 +315,7 @@ fn a_learner_that_a_signal_asked_to_end_is_restarted_and_one_that_was_stopped_is
 /// What may happen, as small numbers that choose among what is there.
 #[derive(Clone, Debug)]
 enum Happens {
-    /// A signal; TERM and INT let a process end in order, unless it hangs.
+    /// A signal; TERM and INT let a process shut down gracefully, unless it hangs.
     Signal {
         which: usize,
         signal: i32,
@@ -426,7 +426,7 @@ fn a_learner_that_takes_long_to_begin_is_waited_for_with_a_word() {
     );
     assert_eq!(supervisor.deadline(), Some(at(600)));
     assert!(supervisor.handle(Event::Tick, at(31)).is_empty(), "it is said once");
-    // Whoever wants the end does not wait so long.
+    // The end does not wait so long.
     supervisor.handle(Event::Interrupted, at(40));
     assert_eq!(supervisor.deadline(), Some(at(30)));
     assert_eq!(supervisor.handle(Event::Tick, at(40)), [Effect::AskToEnd(Place::Learner)]);

@@ -183,7 +183,7 @@ spec:
       # Bad input is no better a second time.
       - action: FailIndex
         onExitCodes: {{ containerName: run, operator: In, values: [2] }}
-      # A node that is drained is nobody's fault.
+      # A drained node is not the run's fault.
       - action: Ignore
         onPodConditions: [{{ type: DisruptionTarget, status: "True" }}]
   template:

@@ -99,7 +99,7 @@ async fn all(dir: &Path, plan: &Plan, options: &SweepOptions) -> Result<ExitCode
                 "another `rit sweep` runs in {dir}; `rit sweep status {dir}` shows how it stands"
             )));
         }
-        // A file system that locks no folders: whoever starts two sweeps there finds the runs' own locks.
+        // A file system that locks no folders: the second of two sweeps there finds the runs' own locks.
         Err(TryLockError::Error(_)) | Ok(()) => {}
     }
     let share = Share::of_this_machine(options.jobs);

@@ -243,7 +243,7 @@ impl Jobs<'_> {
         self.screen.show(standing::in_words(&self.standings), rows);
     }
 
-    /// Asks every run to end in order.
+    /// Asks every run to shut down gracefully.
     fn interrupt(&mut self) {
         self.outcome.interrupted = true;
         self.screen.say("interrupted: the runs write their checkpoints and end");

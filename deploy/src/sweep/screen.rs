@@ -60,12 +60,12 @@ impl Screen {
 
     fn send(&self, news: News) {
         if let Some(sender) = &self.news {
-            // Nobody reads what waits already.
+            // What waits already has no reader.
             let _ = sender.try_send(news);
         }
     }
 
-    /// Takes the table away when all is written, or nobody reads it.
+    /// Takes the table away when all is written, or it has no reader.
     pub fn finish(&mut self) {
         self.news = None;
         // Nothing is ever sent: it ends when the thread does.
@@ -106,7 +106,7 @@ fn on_terminal(queue: &Receiver<News>) {
 fn plainly(queue: &Receiver<News>) {
     let mut printed = Instant::now();
     for news in queue {
-        // Nobody may be there to read it.
+        // There may be no reader.
         match news {
             News::Table(whole, rows) if printed.elapsed() >= PLAIN_EVERY => {
                 printed = Instant::now();

@@ -20,7 +20,7 @@ use tokio::sync::mpsc;
 
 /// Where the view goes.
 pub enum Screen {
-    /// A terminal, and whoever says that somebody wants no more of it.
+    /// A terminal, and the signals that end it.
     Terminal(Box<DefaultTerminal>, mpsc::Receiver<()>),
     /// Lines.
     Plain {
@@ -53,7 +53,7 @@ impl Screen {
         Ok(Self::Terminal(Box::new(terminal), quits))
     }
 
-    /// Shows how the run stands; says whether anybody still looks. A terminal that does not take it has gone.
+    /// Shows how the run stands; says whether the terminal is still there. A terminal that does not take it has gone.
     ///
     /// # Errors
     /// When lines cannot be written.

@@ -1,4 +1,4 @@
-//! Real processes of the `rit` binary, and what they leave behind.
+//! Real processes of the `rit` binary, and the files that they leave.
 #![allow(dead_code, reason = "each test binary uses its part")]
 
 use rustix::process::{Pid, Signal, kill_process, test_kill_process};
@@ -254,7 +254,7 @@ pub fn json_lines(path: &Path) -> Vec<Value> {
     fs::read_to_string(path).unwrap().lines().map(|line| serde_json::from_str(line).unwrap()).collect()
 }
 
-/// The lines of a run's metrics behind the first, which says whose they are.
+/// The lines of a run's metrics after the first, which says whose they are.
 pub fn metrics_lines(run_dir: &Path) -> Vec<Value> {
     let mut lines = json_lines(&run_dir.join("metrics.jsonl"));
     let run_id = fs::read_to_string(run_dir.join("run_id")).unwrap();

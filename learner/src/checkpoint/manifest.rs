@@ -6,7 +6,7 @@ use rit_config::Algorithm;
 use rit_record::{Best, Exploring, Progress, TaskResult};
 use serde::{Deserialize, Serialize};
 
-/// Beyond what anybody trains: sums of so many steps do not overflow.
+/// Beyond all that is trained: sums of so many steps do not overflow.
 const ENV_STEPS_LIMIT: u64 = 1 << 53;
 
 /// The small part of a checkpoint, as it stands in `checkpoint.json`.
@@ -82,7 +82,7 @@ impl Manifest {
         fits(updates <= batches, format!("{updates} updates are more than {batches} batches"))?;
         fits(
             self.target_copied_at <= episodes,
-            format!("target_copied_at = {} lies behind {episodes} episodes", self.target_copied_at),
+            format!("target_copied_at = {} lies after {episodes} episodes", self.target_copied_at),
         )?;
         self.check_snapshots(algorithm.policy_lag + 1)?;
         fits(self.recent.len() == tasks, format!("recent has {} tasks, not {tasks}", self.recent.len()))?;
@@ -159,7 +159,7 @@ mod tests {
         assert_eq!(refused(|m| m.progress.episodes = 14), "14 episodes do not fit into 12 steps");
         assert_eq!(refused(|m| m.progress.episodes = 7), "7 episodes are no whole batches of 2");
         assert_eq!(refused(|m| m.progress.updates = 4), "4 updates are more than 3 batches");
-        assert_eq!(refused(|m| m.target_copied_at = 7), "target_copied_at = 7 lies behind 6 episodes");
+        assert_eq!(refused(|m| m.target_copied_at = 7), "target_copied_at = 7 lies after 6 episodes");
         assert_eq!(refused(|m| m.recent.clear()), "recent has 0 tasks, not 2");
         assert_eq!(
             refused(|m| m.recent[0].push((0.0, false))),

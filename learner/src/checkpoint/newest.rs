@@ -90,7 +90,7 @@ pub enum Which {
     Step(u64),
 }
 
-/// The file of the weights, for whoever wants them alone; `None` for a run that has never written a checkpoint.
+/// The file of the weights, for a reader that wants them alone; `None` for a run that has never written a checkpoint.
 ///
 /// # Errors
 /// When there was one and it is gone, when it is of another run or build, or when these weights are not kept.

@@ -325,7 +325,7 @@ fn what_a_person_put_there_is_not_read_for_ever() {
     assert!(loaded.warnings[0].contains("it is no regular file"), "{:?}", loaded.warnings);
 }
 
-/// Whoever looks at any moment, as a learner does that is started after a kill at that moment, finds a checkpoint.
+/// At any moment there is a checkpoint to find, as a learner must that is started after a kill at that moment.
 #[test]
 fn at_every_moment_of_repeating_a_checkpoint_there_is_one() {
     let run = run();

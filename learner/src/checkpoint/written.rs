@@ -43,7 +43,7 @@ pub(super) fn newest(run_dir: &RunDir) -> Option<String> {
     // What tells of it where that file is gone.
     let latest = fs::read_link(run_dir.checkpoints().join(LATEST));
     latest.ok().map(|target| target.display().to_string()).or_else(|| {
-        // A run that has ended in order wrote one; one that failed may never have come so far.
+        // A run that has ended gracefully wrote one; one that failed may never have come so far.
         let ended = Summary::read(run_dir).ok().flatten()?.ended;
         (ended != Ended::Failed).then(|| "summary.json tells of it".into())
     })

@@ -27,7 +27,7 @@ impl Coordinator {
             return Err(Refusal::Layout { name, theirs: layout_version, ours: wire::LAYOUT_VERSION });
         }
         // The same process, whose link broke before this side noticed; the successor of one given up; or, in a slot,
-        // whoever comes later: the supervisor starts nobody beside another.
+        // the one that comes later: the supervisor starts no actor beside another.
         let follows = |other: &Actor| match (slot, other.slot) {
             (None, None) => other.name == name && (other.instance == instance || other.hung),
             (ours, theirs) => ours == theirs,

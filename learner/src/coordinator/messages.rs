@@ -31,7 +31,7 @@ pub enum Input {
     Leaving(ActorId),
     /// An actor's stream has ended.
     Gone(ActorId),
-    /// Shared memory is elsewhere from now on, with what somebody should know of the new place: whoever sends there has
+    /// Shared memory is elsewhere from now on, with what a person should know of the new place: actors that send there have
     /// to join again.
     PlaceLost(Option<String>),
     /// The trainer speaks.

@@ -46,7 +46,7 @@ pub enum Event {
     Leaving(ActorId),
     /// An actor's stream has ended.
     Gone(ActorId),
-    /// Shared memory is elsewhere from now on, with what somebody should know of the new place: whoever sends there has
+    /// Shared memory is elsewhere from now on, with what a person should know of the new place: actors that send there have
     /// to join again.
     PlaceLost(Option<String>),
     /// The trainer speaks.
@@ -149,11 +149,11 @@ impl Shell {
         });
     }
 
-    /// Whoever asked may have gone; the answers are then nobody's.
+    /// The caller may have gone; the answer is then dropped.
     fn control(&mut self, control: Control) {
         let (input, answer) = match control {
             Control::Checkpoint(answer) => {
-                // Without a trainer the run is over, and nobody answers.
+                // Without a trainer the run is over, and no answer comes.
                 let _ = self.work.send(Work::Checkpoint(answer));
                 return;
             }
@@ -188,7 +188,7 @@ impl Shell {
             Effect::Admit(id) => return self.admit(id, waiting.take()?),
             Effect::Refuse(refusal) => {
                 let (_, answer) = waiting.take()?;
-                // Whoever wanted to join may have gone.
+                // The actor that wanted to join may have gone.
                 let _ = answer.send(Err(refused(&refusal)));
             }
             Effect::Lease { actor, lease, episodes, terms: Terms { weights_version, epsilon } } => {

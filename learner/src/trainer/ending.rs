@@ -69,7 +69,7 @@ impl Trainer {
     }
 
     /// The last weights on the training tasks, and on the testing tasks if those are evaluated at all: means. Its lines lie
-    /// behind the last checkpoint, so a run that is gone on with forgets them.
+    /// after the last checkpoint, so a run that is gone on with forgets them.
     fn last_evaluation(&mut self) -> Result<[BTreeMap<String, TaskResult>; 2], TrainError> {
         let progress = self.standing.progress;
         let episodes = self.config.evaluation.episodes as u64;
@@ -147,7 +147,7 @@ impl Trainer {
             match work.recv_timeout(RETRY_EVERY) {
                 Ok(Work::Set(config)) => self.config = Config::clone(&config),
                 Ok(Work::Stop(_)) => return Err(error),
-                // Whoever wants more of a run that is over is told so by its end.
+                // Callers that want more of a run that is over are told so by its end.
                 Ok(Work::Batch(_) | Work::Checkpoint(_)) | Err(mpsc::RecvTimeoutError::Timeout) => {}
                 Err(mpsc::RecvTimeoutError::Disconnected) => thread::sleep(RETRY_EVERY),
             }

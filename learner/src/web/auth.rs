@@ -24,7 +24,7 @@ pub struct Gate {
     home: Home,
 }
 
-/// What whoever is let in sees at `/`.
+/// What callers that are let in see at `/`.
 #[derive(Clone, Copy, Debug)]
 pub enum Home {
     /// This page.
@@ -64,7 +64,7 @@ pub struct Entry {
     token: Option<String>,
 }
 
-/// `/`: the page for whoever has the cookie; the cookie for whoever has the token, which then leaves the
+/// `/`: the page for browsers with the cookie; the cookie for those with the token, which then leaves the
 /// address bar.
 pub async fn enter(
     State(gate): State<Arc<Gate>>,
@@ -94,7 +94,7 @@ pub async fn only_to_loopback(request: Request, next: Next) -> Response {
     }
 }
 
-/// Refuses whoever does not know the token; and whatever changes something, unless the page itself asks for it.
+/// Refuses callers that do not know the token; and whatever changes something, unless the page itself asks for it.
 pub async fn only_with_token(State(gate): State<Arc<Gate>>, request: Request, next: Next) -> Response {
     if !gate.lets_in(request.headers()) {
         return ApiError::Unauthorized.into_response();

@@ -1,5 +1,5 @@
-//! The door of a page: plain HTTP on a loopback address, for whoever knows a token. A run's own page and `rit serve` stand
-//! behind it.
+//! The door of a page: plain HTTP on a loopback address, for those that know a token. A run's own page and `rit serve` use
+//! it.
 
 use super::{
     api::ApiError,
@@ -98,7 +98,7 @@ impl Door {
                 }
             };
             let (place, leave) = places.stranger();
-            // Whoever shows the token makes its connection's place a known one.
+            // A caller that shows the token makes its connection's place a known one.
             let service = TowerToHyperService::new(router.clone().layer(Extension(place.clone())));
             let stream = Guarded::new(stream, place, leave);
             connections.spawn(async move {
@@ -112,7 +112,7 @@ impl Door {
     }
 }
 
-/// These routes for whoever the gate lets in; `/` is the gate itself, `/healthz` needs no token.
+/// These routes for callers that the gate lets in; `/` is the gate itself, `/healthz` needs no token.
 pub fn guarded(gate: Gate, routes: Router) -> Router {
     let gate = Arc::new(gate);
     let guarded = routes

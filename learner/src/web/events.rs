@@ -75,7 +75,7 @@ async fn feed(
     metrics.begin_at(known.map_or(0, |position| position.offset));
     let mut ticks = tokio::time::interval(STATUS_EVERY);
     loop {
-        // The end is told at once: soon after it nobody is there to tell.
+        // The end is told at once: soon after it no browser is there to tell.
         tokio::select! {
             _ = ticks.tick() => {}
             () = page.handle.over() => {}

@@ -1,5 +1,5 @@
 //! The page that shows a run and steers it, served to this machine's own browsers: plain HTTP on a loopback
-//! address, for whoever knows the run's token.
+//! address, for those that know the run's token.
 //!
 //! `auth` decides who gets in, `api` answers, `events` says what is new; `assets/` is the page itself. It
 //! speaks to the run by a [`RunHandle`] as gRPC callers do, so nothing here can change what is trained.

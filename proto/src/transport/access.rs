@@ -25,7 +25,7 @@ pub struct AccessFiles {
     pub certificate: Option<PathBuf>,
     /// Its key.
     pub key: Option<PathBuf>,
-    /// Whoever calls must have a certificate of this authority.
+    /// Callers must have a certificate of this authority.
     pub client_ca: Option<PathBuf>,
 }
 
@@ -76,7 +76,7 @@ impl fmt::Debug for Access {
 }
 
 impl Access {
-    /// This token, over a link that nobody can listen in on.
+    /// This token, over a link that others cannot listen in on.
     pub fn token(token: &str) -> Self {
         Self { token: Some(token.to_owned()), tls: None }
     }
@@ -84,7 +84,7 @@ impl Access {
     /// What these files say, for a TCP address.
     ///
     /// # Errors
-    /// When that would let anybody in, or a file cannot be used.
+    /// When that would let every caller in, or a file cannot be used.
     pub fn over_tcp(address: &Address, files: &AccessFiles) -> Result<Self, AccessError> {
         let AccessFiles { token, certificate, key, client_ca } = files;
         let identity = match (certificate, key) {

@@ -117,7 +117,7 @@ impl Credentials {
 /// Why a learner cannot be spoken to.
 #[derive(Debug, thiserror::Error)]
 pub enum ConnectError {
-    /// Nobody answers there, or closes the connection.
+    /// No answer comes from there, or the connection is closed.
     #[error("no learner answers on {address}; is the run still going? ({reason})")]
     NoAnswer {
         /// Where it was expected.
@@ -128,9 +128,9 @@ pub enum ConnectError {
     /// What is sent would be readable on its way.
     #[error("{0} is on another host: without --tls-ca everything would cross the network in clear text")]
     ClearText(Address),
-    /// Whoever answers has no certificate of the authority given.
+    /// The program that answers has no certificate of the authority given.
     #[error(
-        "whoever answers on {address} does not prove to be the learner ({reason}); is --tls-ca its authority?"
+        "the program that answers on {address} does not prove to be the learner ({reason}); is --tls-ca its authority?"
     )]
     Untrusted {
         /// Who answered.
@@ -206,7 +206,7 @@ fn deadline(method: &GrpcMethod<'static>) -> Option<Duration> {
 /// Connects to a learner and makes sure that it listens to this caller.
 ///
 /// # Errors
-/// When nobody answers there, either side does not trust the other, or what is sent could be overheard.
+/// When no answer comes from there, either side does not trust the other, or what is sent could be overheard.
 pub async fn connect(address: &Address, credentials: &Credentials) -> Result<Client, ConnectError> {
     let Credentials { token, tls } = credentials;
     if tls.is_none() && !address.is_local() {

@@ -58,7 +58,7 @@ pub enum FileError {
     },
 }
 
-/// Whether a file is this user's, and for nobody else to read.
+/// Whether a file is this user's, and other users cannot read it.
 ///
 /// # Errors
 /// When it is not.
@@ -76,7 +76,7 @@ pub fn check_private(path: &Path, metadata: &Metadata) -> Result<(), FileError> 
 
 fn read(path: &Path, check: impl FnOnce(&Metadata) -> Result<(), FileError>) -> Result<Vec<u8>, FileError> {
     let io = |error| FileError::Io { path: path.to_owned(), error };
-    // What is looked at is what is read: the open file, not its name. A pipe that nobody writes to opens at once.
+    // What is looked at is what is read: the open file, not its name. A pipe without a writer opens at once.
     let file = rustix::fs::open(path, OFlags::RDONLY | OFlags::NONBLOCK | OFlags::CLOEXEC, Mode::empty());
     let file = File::from(file.map_err(|error| io(error.into()))?);
     let metadata = file.metadata().map_err(io)?;

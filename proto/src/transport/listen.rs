@@ -148,7 +148,7 @@ impl Incoming {
                 return Err(ListenError::NotASocket(path.to_owned()));
             }
             Ok(_) if is_answered(path).await => return Err(ListenError::InUse(address)),
-            // Nobody answers: its learner is dead.
+            // No answer: its learner is dead.
             Ok(_) => fs::remove_file(path).map_err(io)?,
         }
         let listener = UnixListener::bind(path).map_err(io)?;
@@ -206,7 +206,7 @@ impl Incoming {
             };
             match let_in {
                 Ok(connection) => {
-                    // Nobody takes connections any more: the server is about to end.
+                    // Connections are no longer taken: the server is about to end.
                     let _ = connections.send(Ok(connection)).await;
                 }
                 Err(refused) => {

@@ -1,4 +1,4 @@
-//! Addresses, and how to listen and connect, so that nobody gets in who should not.
+//! Addresses, and how to listen and connect, so that only those get in who may.
 //!
 //! A Unix socket in the run directory is always there: its folder has mode 700, it has mode 600 itself, the system is
 //! asked who calls, and the caller must know the run's token. TCP is there when somebody asks for it, and then:
@@ -35,10 +35,10 @@ use std::time::Duration;
 /// What HTTP/2 is called in a TLS handshake.
 const ALPN_HTTP2: &[u8] = b"h2";
 
-/// How long connecting, and greeting whoever connects, may take.
+/// How long connecting, and greeting a caller, may take.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// How long whoever connects may take to show that it may speak.
+/// How long a caller may take to show that it may speak.
 pub const STRANGER_DEADLINE: Duration = Duration::from_secs(10);
 
 /// How long most calls may take: their answers are at hand.

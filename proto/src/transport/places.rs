@@ -1,6 +1,6 @@
-//! Places for connections. Whoever has not shown yet that it may speak is a *stranger*: it has one of a few places of
-//! its own for a few seconds, and gives it up to the next stranger when all are taken. Whoever has shown it is *known*
-//! and has one of the other places for as long as it stays. So no number of silent connections keeps anybody out.
+//! Places for connections. A caller that has not shown yet that it may speak is a *stranger*: it has one of a few places of
+//! its own for a few seconds, and gives it up to the next stranger when all are taken. One that has shown it is *known*
+//! and has one of the other places for as long as it stays. So no number of silent connections keeps a known caller out.
 
 use std::{
     collections::VecDeque,
@@ -157,7 +157,7 @@ impl Future for Leave {
     type Output = ();
 
     fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<()> {
-        // Whether it was told or nobody can tell it any more.
+        // Whether it was told or those that could tell it are gone.
         let has_ended = self.ended.as_mut().is_none_or(|ended| Pin::new(ended).poll(cx).is_ready());
         if has_ended || self.deadline.as_mut().poll(cx).is_ready() {
             self.ended = None;

@@ -47,7 +47,7 @@ impl Default for ServeLimits {
     }
 }
 
-/// Serves whoever `access` lets in, until `closed` resolves and the last connection has ended.
+/// Serves the callers that `access` lets in, until `closed` resolves and the last connection has ended.
 ///
 /// # Errors
 /// When the server fails.
@@ -67,7 +67,7 @@ pub async fn serve(
             never = incoming.accept(&access, &places, &connections) => match never {},
             () = closed => {}
         }
-        // Nobody is accepted any more; the socket goes now, not when the last connection has ended.
+        // Connections are no longer accepted; the socket goes now, not when the last connection has ended.
         drop((incoming, stop));
     };
     let serving = Server::builder()

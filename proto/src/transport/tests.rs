@@ -158,7 +158,7 @@ async fn a_socket_in_use_is_refused_and_a_stale_one_replaced() {
     assert!(matches!(Incoming::bind(&address).await, Err(ListenError::InUse(_))));
     drop(first);
     assert!(!path.exists());
-    // What a killed learner leaves: a socket file that nobody listens on.
+    // What a killed learner leaves: a socket file without a listener.
     drop(std::os::unix::net::UnixListener::bind(path).unwrap());
     Incoming::bind(&address).await.unwrap();
 
@@ -314,7 +314,7 @@ async fn both_sides_prove_who_they_are() {
     // No TLS at all.
     let plain = connect(address, &Credentials::token(TOKEN)).await;
     assert!(matches!(plain, Err(ConnectError::NoAnswer { .. })), "{plain:?}");
-    // And after all of them, whoever may is still let in.
+    // And after all of them, a caller with the token is still let in.
     connect(address, &credentials(&ca, Some(&client), None)).await.unwrap();
 }
 
@@ -413,7 +413,7 @@ async fn silent_connections_keep_nobody_out_and_are_closed() {
             silent.push(tokio::net::TcpStream::connect((host.as_str(), *port)).await.unwrap());
         }
         let after = connect(&learner.address, &credentials).await.unwrap();
-        // All but the newest few were closed for those behind them.
+        // All but the newest few were closed for those that came after them.
         for stream in &mut silent[..590] {
             let end = async { while stream.read(&mut [0; 64]).await.is_ok_and(|read| read > 0) {} };
             tokio::time::timeout(Duration::from_secs(60), end).await.expect("it is closed");
@@ -438,7 +438,7 @@ async fn whoever_does_not_show_the_token_in_time_is_closed() {
     let end = async { while silent.read(&mut [0; 64]).await.is_ok_and(|read| read > 0) {} };
     tokio::time::timeout(Duration::from_secs(60), end).await.expect("it is closed");
     let answer = ControlClient::new(known).pause(v1::PauseRequest {}).await.unwrap_err();
-    assert_eq!(answer.code(), Code::Unimplemented, "whoever is known stays: {answer}");
+    assert_eq!(answer.code(), Code::Unimplemented, "a known caller stays: {answer}");
 }
 
 #[tokio::test]
@@ -452,7 +452,7 @@ async fn no_more_calls_than_are_taken_on_and_each_ends() {
         let mut control = control.clone();
         waiting.push(tokio::spawn(async move { control.status(v1::StatusRequest {}).await }));
     }
-    // Both wait; whoever comes now is told at once.
+    // Both wait; the next caller is told at once.
     let in_time = tokio::time::timeout(Duration::from_secs(60), async {
         while control.pause(v1::PauseRequest {}).await.unwrap_err().code() != Code::ResourceExhausted {
             tokio::task::yield_now().await;
@@ -463,7 +463,7 @@ async fn no_more_calls_than_are_taken_on_and_each_ends() {
     for waiting in waiting {
         waiting.await.unwrap().unwrap();
     }
-    // Nobody answers this one: its own deadline ends it.
+    // No answer comes to this one: its own deadline ends it.
     let mut hurried = Request::new(v1::StatusRequest {});
     hurried.set_timeout(Duration::from_millis(20));
     let late = control.status(hurried).await.unwrap_err();

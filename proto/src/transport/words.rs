@@ -4,7 +4,7 @@ use std::error::Error as _;
 use tonic::{Code, Status};
 
 /// Why a call failed, in words. What the other side says of it is kept; what the libraries say of a connection that
-/// broke means nothing to whoever reads it.
+/// broke means nothing to its reader.
 pub fn status_words(status: &Status) -> String {
     let broke = || "the connection broke".to_owned();
     match status.code() {

@@ -7,7 +7,7 @@ impl Config {
     /// Every number's name, value, smallest and largest.
     pub(crate) fn limits(&self) -> Vec<(&'static str, Number, f64, f64)> {
         let (algorithm, network, evaluation) = (&self.algorithm, &self.network, &self.evaluation);
-        // Beyond what anybody runs; they keep a slip of the keyboard from taking all memory.
+        // Beyond all that is run; they keep a slip of the keyboard from taking all memory.
         const COUNT: f64 = 1e6;
         const STEPS: f64 = 1e12;
         const SIZE: f64 = 4096.0;

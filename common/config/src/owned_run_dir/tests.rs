@@ -17,7 +17,7 @@ fn copy(from: &Path, to: &Path) {
     assert!(Command::new("cp").arg("-a").args([from, to]).status().unwrap().success());
 }
 
-/// Every file below a folder with what it holds, but for the lock's, which names whoever looked last.
+/// Every file below a folder with what it holds, but for the lock's, which names the process that looked last.
 fn contents(root: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     let mut all = Vec::new();
     for entry in fs::read_dir(root).unwrap() {

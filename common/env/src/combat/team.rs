@@ -31,7 +31,7 @@ pub enum TeamError {
         "{0:?} is no team; write counts and letters such as 5s3z or 3m-vs-4m: m marine, M marauder, v medivac, s stalker, z zealot, c colossus"
     )]
     Name(String),
-    /// It has nobody or too many.
+    /// It has no unit or too many.
     #[error("{name} has {units} units; a side has 1 to {TEAM_MAX}")]
     Size {
         /// The team.
@@ -50,7 +50,7 @@ pub enum TeamError {
         set: CombatSet,
     },
     /// It cannot win.
-    #[error("{name} has nobody who can attack")]
+    #[error("{name} has no unit that can attack")]
     Unarmed {
         /// The team.
         name: String,
@@ -72,7 +72,7 @@ impl Team {
         self.0.iter().map(|&count| usize::from(count)).sum()
     }
 
-    /// Whether nobody is in it.
+    /// Whether no unit is in it.
     pub fn is_empty(self) -> bool {
         self.len() == 0
     }
@@ -279,7 +279,7 @@ mod tests {
             refused("2m1z", CombatSet::Marines),
             "2m1z has a unit of type 'z', which 3-8m does not have; it has m"
         );
-        assert_eq!(refused("2v", CombatSet::MarinesMaraudersMedivacs), "2v has nobody who can attack");
+        assert_eq!(refused("2v", CombatSet::MarinesMaraudersMedivacs), "2v has no unit that can attack");
         for name in ["", "m", "3", "0m", "3m3m", "3x", "-3m", "300m", "3é"] {
             assert!(Team::parse(name, CombatSet::Marines).is_err(), "{name}");
         }

@@ -191,7 +191,7 @@ impl Translation {
     /// actions call them, by that number: the allies' (8 to 15), then the enemies' (0 to 7).
     ///
     /// # Errors
-    /// When a side has nobody or too many.
+    /// When a side has no unit or too many.
     pub fn begin(&mut self, units: &[RawUnit], tags: [&[usize]; 2]) -> Result<(), WrongUnits> {
         self.rows.clear();
         self.steps = 0;
@@ -364,7 +364,7 @@ impl Translation {
         Some((ally.unit.tag, order))
     }
 
-    /// Takes the units after a step; whoever is missing is dead. Returns what the step paid and whether the episode
+    /// Takes the units after a step; a unit that is missing is dead. Returns what the step paid and whether the episode
     /// has ended.
     pub fn advance(&mut self, units: &[RawUnit]) -> Step {
         self.steps += 1;

@@ -106,7 +106,7 @@ pub struct World {
     busy_until: Vec<i64>,
     /// Which side a unit passes standing bodies on, while it goes round them.
     detours: Vec<Option<f64>>,
-    /// Whether bodies may overlap although nobody has moved.
+    /// Whether bodies may overlap although none has moved.
     crowded: bool,
     effects: Vec<Effect>,
     orders_refused: u64,
@@ -369,7 +369,7 @@ impl World {
         self.now < self.busy_until[unit]
     }
 
-    /// Whom the unit attacks or heals, if anybody.
+    /// Whom the unit attacks or heals, if any.
     fn target(&self, unit: usize) -> Option<usize> {
         match self.orders[unit] {
             Order::Attack(target) | Order::Heal(target) => Some(target),

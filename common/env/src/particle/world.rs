@@ -174,7 +174,7 @@ impl World {
                 let Some(force) = contact_force(first.position, second.position, touching) else {
                     continue;
                 };
-                // What does not move is pushed in vain: nobody reads its force.
+                // What does not move is pushed in vain: its force is not read.
                 first.force = sum(first.force, force);
                 second.force = sum(second.force, scaled(force, -1.0));
             }

@@ -161,7 +161,7 @@ impl Run {
         let sent = work.send(Work::Batch(self.next.clone()));
         assert!(sent.is_ok(), "the queue is here");
         drop(work);
-        // Nobody writes the last checkpoint. Whatever the weights were altered to, their loss need not be finite.
+        // There is no writer for the last checkpoint. Whatever the weights were altered to, their loss need not be finite.
         let trained = trainer.run(&queue);
         assert!(
             matches!(trained, Err(TrainError::Checkpoint(_) | TrainError::NotFinite { .. })),

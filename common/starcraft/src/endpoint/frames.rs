@@ -16,7 +16,7 @@ use tungstenite::{
 /// Longest message: a map and a little more.
 const MESSAGE_MAX: usize = 64 << 20;
 
-/// How long whoever connects may take to say what it wants.
+/// How long a client may take to say what it wants.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// What can go wrong with a client's connection.
@@ -96,7 +96,7 @@ impl Frames {
                     continue;
                 }
                 (OpCode::Control(Control::Close), _) => {
-                    // Whoever says goodbye may be gone before the answer.
+                    // A client that says goodbye may be gone before the answer.
                     let _ = self.0.send(Frame::close(None));
                     return Ok(None);
                 }

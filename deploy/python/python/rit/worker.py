@@ -29,7 +29,7 @@ PROTOCOL_VERSION = 1
 HEADER = struct.Struct("<IHH")
 #: Reward, end, won.
 STATE_HEAD = struct.Struct("<fBB")
-#: Nobody sends more.
+#: More is never sent.
 BODY_MAX = 1 << 26
 
 #: Answers wait for each other, up to so many bytes.

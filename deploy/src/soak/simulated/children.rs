@@ -91,7 +91,7 @@ impl<M: Machines> World<M> {
     pub(super) fn begins(&mut self, process: usize) {
         match self.processes[process].place {
             Place::Learner => self.learner_begins(process),
-            // Memory that cannot be had is a signal to whoever writes to it.
+            // Memory that cannot be had is a signal to the process that writes to it.
             Place::Actor(_) if self.now < self.memory_full_until => self.dies(process, Exit::Signal(7)),
             Place::Actor(_) => self.connects(process),
         }

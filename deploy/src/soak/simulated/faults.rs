@@ -18,7 +18,7 @@ const DEADLY: [i32; 5] = [1, 3, 7, 9, 11];
 pub enum Fault {
     /// A signal to a process.
     Signal { which: usize, signal: i32 },
-    /// A process stops, and goes on after so many milliseconds, if nobody has killed it.
+    /// A process stops, and goes on after so many milliseconds, if it has not been killed.
     Stop { which: usize, ms: u64 },
     /// `rit ctl set actors.count`.
     Count(u32),
@@ -26,7 +26,7 @@ pub enum Fault {
     Pause { ms: u64 },
     /// The disk is full for so many milliseconds.
     DiskFull { ms: u64 },
-    /// Shared memory is full for so many milliseconds: whoever starts dies of it.
+    /// Shared memory is full for so many milliseconds: a process that starts dies of it.
     MemoryFull { ms: u64 },
     /// So many frames arrive damaged.
     Damage { frames: u32 },

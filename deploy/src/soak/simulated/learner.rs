@@ -305,7 +305,7 @@ impl<M: Machines> World<M> {
         self.train_on();
     }
 
-    /// A batch that is trained on again behind a checkpoint must be what it was.
+    /// A batch that is trained on again after a checkpoint must be what it was.
     fn remember(&mut self, index: u64, version: u64) {
         match self.versions.get(index as usize) {
             Some(&before) if before != version => {

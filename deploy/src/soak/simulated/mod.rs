@@ -39,7 +39,7 @@ struct Tally {
     deaths: u64,
     /// Lives of learners that went on from a checkpoint.
     resumed: u64,
-    /// Episodes trained on, those trained on again behind a checkpoint included.
+    /// Episodes trained on, those trained on again after a checkpoint included.
     trained: u64,
 }
 

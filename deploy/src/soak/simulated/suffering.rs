@@ -48,7 +48,7 @@ impl<M: Machines> World<M> {
             Fault::KillSupervisor => self.loses_supervisor(),
             Fault::Interrupt => {
                 self.may_end_early = true;
-                // One that does not answer is ended otherwise than in order.
+                // One that does not answer is killed.
                 self.may_fail = true;
                 self.tell_supervisor(Event::Interrupted);
             }

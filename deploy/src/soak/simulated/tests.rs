@@ -38,7 +38,7 @@ fn found<M: Machines>(scenarios: u64) -> (usize, String) {
     (broken.len(), broken.first().cloned().unwrap_or_default())
 }
 
-/// A supervisor that keeps its actors in a list, as it once did: one that leaves moves the others up, and whoever is
+/// A supervisor that keeps its actors in a list, as it once did: one that leaves moves the others up, and the one that is
 /// started gets the name of its place in the list.
 struct NamesByIndex {
     inner: Supervisor,
@@ -87,7 +87,7 @@ impl Supervises for NamesByIndex {
     }
 }
 
-/// A supervisor that restarts whoever died at once.
+/// A supervisor that restarts at once what died.
 struct Hasty {
     inner: Supervisor,
     /// Its clock runs ahead by the delays that it does not wait for.

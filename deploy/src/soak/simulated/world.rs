@@ -86,7 +86,7 @@ pub enum What {
     Dies(usize, Exit),
     /// The supervisor of this number finds that a child has ended.
     Reaped(u32, Place, Exit),
-    /// A process hears that it is to end in order.
+    /// A process hears that it is to shut down gracefully.
     Asked(usize),
     /// Somebody asks something of the learner.
     Control(Control),
@@ -110,7 +110,7 @@ pub enum What {
     Fault(Fault),
     /// A process that was stopped goes on.
     GoesOn(usize),
-    /// Whoever resumes the run tries to.
+    /// The run is resumed, or its resume is tried.
     Resumed,
     /// Nothing more is done to the run.
     Peace,
@@ -160,7 +160,7 @@ pub struct Process {
     pub dead: bool,
     /// By SIGSTOP, with what it will find when it goes on.
     pub(super) stopped: Option<Vec<What>>,
-    /// Told to end in order.
+    /// Told to shut down gracefully.
     pub leaving: bool,
     pub actor: Actor,
 }

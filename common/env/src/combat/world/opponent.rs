@@ -27,7 +27,7 @@ impl World {
             return;
         }
         let nearest = self.nearest_opponent(unit);
-        // Whoever hit it from farther away stays its target until another comes near or it is out of sight.
+        // A unit that hit it from farther away stays its target until another comes near or it is out of sight.
         let avenged = living.filter(|&target| {
             nearest.is_none() && self.avenging[unit] && self.edge(unit, target) <= self.stats[unit].sight
         });
@@ -50,7 +50,7 @@ impl World {
         nearest.map(|(_, other)| other)
     }
 
-    /// A scripted unit without a target goes for whoever hits it.
+    /// A scripted unit without a target goes for the unit that hits it.
     pub(super) fn notice_attacker(&mut self, unit: usize, attacker: usize) {
         let idle = matches!(self.orders[unit], Order::AttackMove(_)) && self.aims[unit].is_none();
         if idle && self.alive[attacker] && self.can_hit(unit, attacker) {

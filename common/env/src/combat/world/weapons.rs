@@ -155,7 +155,7 @@ impl World {
         self.notice_attacker(target, from);
     }
 
-    /// The line of a colossus, across its target. No friend is burnt, and nobody in the air.
+    /// The line of a colossus, across its target. No friend is burnt, and no flyer.
     fn burn_line(&mut self, from: usize, target: usize) {
         let (middle, colossus) = (self.positions[target], self.positions[from]);
         let length = distance(colossus, middle);
