@@ -91,8 +91,11 @@ fn an_on_policy_method_learns_from_each_batch_once() {
 #[test]
 fn every_methods_measures_are_in_its_lines() {
     for (method, names) in [
-        (Method::Rit, &["td_loss", "contrastive_loss", "grad_norm", "q_total_mean", "target_mean"][..]),
-        (Method::VdnAttn, &["td_loss", "grad_norm", "q_total_mean", "target_mean"]),
+        (
+            Method::Rit,
+            &["td_loss", "contrastive_loss", "grad_norm", "q_total_mean", "target_mean", "saturated_units"][..],
+        ),
+        (Method::VdnAttn, &["td_loss", "grad_norm", "q_total_mean", "target_mean", "saturated_units"]),
         (Method::Mappo, &["policy_loss", "value_loss", "entropy"]),
     ] {
         let folder = RunFolder::new();

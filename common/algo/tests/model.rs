@@ -329,3 +329,31 @@ fn a_reward_scale_makes_targets_of_rewards_so_much_smaller() {
         assert_ne!(scaled, gradients(1.0, &episodes), "{:?}", networks.case);
     });
 }
+
+#[test]
+fn saturated_units_are_counted_over_decisions() {
+    each!(CASES.iter().filter(|case| !matches!(case.0, Method::UpdetMix | Method::UpdetVdn)), |networks| {
+        let episodes = batch(5);
+        let batch: Vec<&Episode> = episodes.iter().collect();
+        // Large weights drive some units to their bounds, and not all.
+        let params = networks.params(3).iter().map(|x| 8.0 * x).collect();
+        let mut learner = networks.learner(2, 1, params);
+        let counted = Mutex::new((0, 0));
+        let see = |shard: &SeenShard<'_>| {
+            let (_, history) = shard.values().find(|(name, _)| *name == "history").unwrap();
+            let mut counted = counted.lock().unwrap();
+            for (group, step) in shard.rows.groups.iter().zip(&shard.rows.steps) {
+                for row in group.queries.clone().filter(|_| step.filled) {
+                    let units = history.row(row);
+                    counted.0 += units.iter().filter(|unit| !(-0.99..=0.99).contains(*unit)).count();
+                    counted.1 += units.len();
+                }
+            }
+        };
+        let values = learner.gradients_seen(&batch, &networks.draws(&batch), |rows| (0..rows).collect(), see);
+        let (saturated, units) = *counted.lock().unwrap();
+        assert!(0 < saturated && saturated < units, "{:?}: {saturated} of {units}", networks.case);
+        let share = measure(&learner, &values, "saturated_units");
+        assert_eq!(share, saturated as f64 / units as f64, "{:?}", networks.case);
+    });
+}

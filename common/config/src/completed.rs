@@ -1,16 +1,23 @@
 //! Settings that an older build wrote down, as this one says them.
 
-use crate::{ConfigError, resolve};
+use crate::{ConfigError, resolve, saved::KNOWN_SINCE};
 use std::collections::BTreeMap;
 use toml::{Table, Value};
 
-/// These settings with every key that has been added since, at its default, so that what an older build wrote compares
-/// with what this one writes. Settings that this build does not know, or refuses, stay as they are.
-pub fn completed(settings: BTreeMap<String, String>) -> BTreeMap<String, String> {
-    match today(&settings) {
-        Ok(all) => all.into_iter().chain(settings).collect(),
-        Err(_) => settings,
+/// These settings with those keys that have been added since and whose default is what was done before, so that what an
+/// older build wrote compares with what this one writes. Settings that this build does not know, or refuses, stay as they
+/// are.
+pub fn completed(mut settings: BTreeMap<String, String>) -> BTreeMap<String, String> {
+    if KNOWN_SINCE.iter().any(|key| !settings.contains_key(*key))
+        && let Ok(today) = today(&settings)
+    {
+        for key in KNOWN_SINCE {
+            if let (false, Some(value)) = (settings.contains_key(key), today.get(key)) {
+                settings.insert(key.to_owned(), value.clone());
+            }
+        }
     }
+    settings
 }
 
 /// What this build makes of them, every key.
@@ -53,9 +60,11 @@ mod tests {
         ]);
         let today = completed(older.clone());
         assert_eq!(today["algorithm.reward_scale"], "1.0");
-        assert_eq!(today["environment.spawn_rotate"], "published");
+        assert_eq!(today["environment.backend"], "embedded");
+        assert!(!today.contains_key("environment.spawn_rotate"), "what was done then is not known");
         assert!(older.iter().all(|(key, value)| today[key] == *value));
-        assert!(!today.contains_key("network.task_representation_dim"), "vdn-attn has none");
+        let on_policy = completed(of(&[("environment.task_set", "3-8m"), ("algorithm.name", "mappo")]));
+        assert!(!on_policy.contains_key("algorithm.reward_scale"), "mappo has none");
     }
 
     #[test]
@@ -67,8 +76,8 @@ mod tests {
             let settings = config.settings().unwrap();
             assert_eq!(completed(settings.clone()), settings);
             let mut older = settings.clone();
-            older.remove("algorithm.lr");
-            assert_eq!(completed(older)["algorithm.lr"], settings["algorithm.lr"]);
+            older.remove("algorithm.reward_scale");
+            assert_eq!(completed(older), settings);
         }
     }
 

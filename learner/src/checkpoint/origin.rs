@@ -118,7 +118,7 @@ mod tests {
             refused("algorithm.gamma", Some("0.5"))
                 .starts_with("it was trained with algorithm.gamma = 0.5, config.toml says 0.99; set it back")
         );
-        assert!(refused("seed", None).starts_with("it was trained with seed = 1, config.toml says 5"));
+        assert!(refused("seed", None).starts_with("it was trained with seed = nothing, config.toml says 5"));
         // A key that the checkpoint's build did not know had its default then.
         let mut mine_with_scale = mine.clone();
         mine_with_scale.settings.insert("algorithm.reward_scale".into(), "1.0".into());

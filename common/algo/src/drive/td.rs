@@ -44,6 +44,8 @@ pub struct ValueParts {
     pub n_actions: usize,
     /// Numbers that an agent remembers from step to step.
     pub memory_dim: usize,
+    /// Whether they are a GRU's units, which lie within ±1.
+    pub gru: bool,
     /// How utilities become Q_total; a sum without it.
     pub mixer: Option<Mixer>,
     /// Task representations and who tells them apart.
@@ -162,7 +164,7 @@ pub trait ValueNetwork: Send + Sync + 'static {
     fn parts(&self) -> &ValueParts;
 
     /// What an update reports: `td_loss`, `contrastive_loss` where there is one, the method's own, `grad_norm`,
-    /// `q_total_mean`, `target_mean`.
+    /// `q_total_mean`, `target_mean`, and `saturated_units` of a GRU.
     fn measures(&self) -> &'static [Measure];
 
     /// What the decoder makes of these weights; nothing without a decoder.
@@ -340,13 +342,17 @@ impl<N: ValueNetwork> TdLearner<N> {
         derived.backward(online.params, grads);
         let grad_norm = optimizer::sum_of_squares(&grads[..parameters]).sqrt();
         let filled = update.totals.filled as f64;
-        let [td, contrastive, q_total, target] = sums.common;
+        let [td, contrastive, q_total, target, saturated] = sums.common;
         let mut measures = vec![td / filled];
         if network.parts().task.is_some() {
             measures.push(contrastive);
         }
         measures.extend(network.losses(&sums.own));
         measures.extend([grad_norm, q_total / filled, target / filled]);
+        if network.parts().gru {
+            let units = update.totals.filled_agents * network.parts().memory_dim;
+            measures.push(saturated / units as f64);
+        }
         measures
     }
 

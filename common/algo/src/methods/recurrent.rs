@@ -69,7 +69,7 @@ impl Recurrent {
         let target = 0..layout.len();
         let task = task_encoder.map(|task_encoder| (task_encoder, Discriminator::new(layout, z, h)));
         let (layout, n_actions) = (Layout::default(), config.n_actions);
-        let parts = ValueParts { layout, acting, target, n_actions, memory_dim: h, mixer, task };
+        let parts = ValueParts { layout, acting, target, n_actions, memory_dim: h, gru: true, mixer, task };
         Self { parts, beside, encoder, gru, output }
     }
 }
@@ -84,7 +84,7 @@ impl ValueNetwork for Recurrent {
     }
 
     fn measures(&self) -> &'static [Measure] {
-        if self.parts.task.is_some() { &measures::TD_AND_CONTRASTIVE } else { &measures::TD }
+        if self.parts.task.is_some() { &measures::TD_AND_CONTRASTIVE } else { &measures::TD_OF_GRU }
     }
 
     fn tables(&self, params: &[f32]) -> Tables {

@@ -22,12 +22,13 @@ use rit_nn::{
 /// Passes that go through an episode in training: the real one, within the own group, and across groups.
 const PASSES: usize = 3;
 
-const MEASURES: [Measure; 5] = [
+const MEASURES: [Measure; 6] = [
     measures::TD_LOSS,
     Measure { name: "imagined_loss", help: "TD loss of imagined sub-groups" },
     measures::GRAD_NORM,
     measures::Q_TOTAL_MEAN,
     measures::TARGET_MEAN,
+    measures::SATURATED_UNITS,
 ];
 
 /// The utility network, and all else in [`ValueParts`].
@@ -94,6 +95,7 @@ impl Refil {
             target,
             n_actions: config.n_actions,
             memory_dim: h,
+            gru: true,
             mixer: Some(mixer.clone()),
             task: None,
         };

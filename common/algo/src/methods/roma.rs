@@ -16,7 +16,7 @@ use rit_nn::{
     random::fill_standard_normal,
 };
 
-const MEASURES: [Measure; 8] = [
+const MEASURES: [Measure; 9] = [
     measures::TD_LOSS,
     Measure { name: "role_loss", help: "Loss of roles that are unsure or not told from the past" },
     Measure { name: "role_entropy", help: "Mean entropy of roles" },
@@ -25,6 +25,7 @@ const MEASURES: [Measure; 8] = [
     measures::GRAD_NORM,
     measures::Q_TOTAL_MEAN,
     measures::TARGET_MEAN,
+    measures::SATURATED_UNITS,
 ];
 
 /// The utility network with its roles, and all else in [`ValueParts`].
@@ -104,6 +105,7 @@ impl Roma {
             target,
             n_actions: config.n_actions,
             memory_dim: h,
+            gru: true,
             mixer: Some(mixer),
             task: None,
         };

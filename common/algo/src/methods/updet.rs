@@ -41,7 +41,8 @@ impl Updet {
         let target = 0..layout.len();
         let layout = Layout::default();
         let n_actions = config.n_actions;
-        let parts = ValueParts { layout, acting, target, n_actions, memory_dim: h, mixer, task: None };
+        let parts =
+            ValueParts { layout, acting, target, n_actions, memory_dim: h, gru: false, mixer, task: None };
         Self { parts, embed, block, head }
     }
 }

@@ -41,8 +41,8 @@ pub(super) struct Shard {
 /// A shard's share of the batch's sums, or the batch's.
 #[derive(Clone, Debug, Default)]
 pub(super) struct ShardSums {
-    /// Squared TD errors; the contrastive loss; Q_total; targets.
-    pub(super) common: [f64; 4],
+    /// Squared TD errors; the contrastive loss; Q_total; targets; saturated units of the agents' memory.
+    pub(super) common: [f64; 5],
     /// The method's own.
     pub(super) own: Sums,
 }
@@ -241,6 +241,9 @@ impl<N: ValueNetwork> Update<'_, N> {
         let values = [tape.slice(q_total), target.slice(target_q_total)];
         let Targets { td_targets, d_total } = self.targets(rows, values, &mut sums.common);
         tape.seed(q_total, View::dense(&d_total, 1));
+        if parts.gru {
+            sums.common[4] = saturated(tape.view(memory), rows) as f64;
+        }
         let pass = TdPass {
             rows,
             inputs: &inputs.own,
@@ -302,14 +305,14 @@ impl<N: ValueNetwork> Update<'_, N> {
 
     /// TD targets, and the TD loss's gradient by Q_total, from the online and the target network's Q_total of each
     /// group; adds to the sums.
-    fn targets(&self, rows: &Rows, [q_total, target_q_total]: [&[f32]; 2], sums: &mut [f64; 4]) -> Targets {
+    fn targets(&self, rows: &Rows, [q_total, target_q_total]: [&[f32]; 2], sums: &mut [f64; 5]) -> Targets {
         let mut td_targets = vec![0.0; rows.steps.len()];
         let mut d_total = vec![0.0; rows.steps.len()];
         for (group, step) in rows.steps.iter().enumerate().filter(|(_, step)| step.filled) {
             let next = rows.next_group(group).map_or(0.0, |next| target_q_total[next]);
             let target = td::target(step.reward * self.reward_scale, self.gamma, step.terminated, next);
             let (loss, d) = td::squared_error(target, q_total[group], self.totals.filled);
-            let [losses, _, q_totals, targets] = sums;
+            let [losses, _, q_totals, targets, _] = sums;
             *losses += loss;
             *q_totals += f64::from(q_total[group]);
             *targets += f64::from(target);
@@ -317,6 +320,14 @@ impl<N: ValueNetwork> Update<'_, N> {
         }
         Targets { td_targets, d_total }
     }
+}
+
+/// Units of agents' memory (R, memory) near their bounds, at the steps where something was decided.
+fn saturated(memory: View<'_>, rows: &Rows) -> usize {
+    const NEAR: f32 = 0.99;
+    let decided = rows.groups.iter().zip(&rows.steps).filter(|(_, step)| step.filled);
+    let of_row = |row| memory.row(row).iter().filter(|unit| unit.abs() > NEAR).count();
+    decided.flat_map(|(group, _)| group.queries.clone()).map(of_row).sum()
 }
 
 /// Of each group; 0 where nothing was decided.
