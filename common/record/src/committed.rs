@@ -1,10 +1,13 @@
 //! Committed records: what of a run is kept under version control, in two small files.
 //!
 //! `NAME.jsonl` is the run's metrics file without the lines of training, its header with the settings as they were at the
-//! end; `NAME.json` is the summary. Builds before there were headers kept a summary inside an object, beside evaluations
+//! end. Of evaluations on schedule it has means alone, which is all that a curve needs; of those at the end every episode.
+//! `NAME.json` is the summary. Builds before there were headers kept a summary inside an object, beside evaluations
 //! of the testing tasks.
 
-use crate::{Line, Lines, RecordError, Summary, TaskResult, record::settings, summary::BYTES_MAX};
+use crate::{
+    Evaluation, Line, Lines, Occasion, RecordError, Summary, TaskResult, record::settings, summary::BYTES_MAX,
+};
 use rit_config::{RunDir, write_whole};
 use serde_json::{Map, Value};
 use std::{
@@ -75,11 +78,16 @@ pub fn commit(root: &Path, stem: &Path) -> Result<[PathBuf; 2], RecordError> {
         }
         text.extend(header.line().map_err(RecordError::io(&metrics))?);
     }
-    while let Some((line, bytes)) = lines.next_with_text()? {
-        if !matches!(line, Line::Training(_)) {
-            text.extend_from_slice(bytes);
-            text.push(b'\n');
+    while let Some(mut line) = lines.next_line()? {
+        match &mut line {
+            Line::Training(_) => continue,
+            Line::Evaluation(Evaluation { occasion: Occasion::Scheduled, tasks, .. }) => {
+                tasks.values_mut().for_each(|task| task.each = None);
+            }
+            _ => {}
         }
+        serde_json::to_writer(&mut text, &line).map_err(|error| RecordError::io(&metrics)(error.into()))?;
+        text.push(b'\n');
     }
     let [metrics, ended] = ["jsonl", "json"].map(|extension| with_added(stem, extension));
     if ended.exists() {

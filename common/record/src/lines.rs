@@ -58,18 +58,10 @@ impl Lines {
     /// # Errors
     /// When the system refuses.
     pub fn next_line(&mut self) -> Result<Option<Line>, RecordError> {
-        Ok(self.next_with_text()?.map(|(line, _)| line))
-    }
-
-    /// The same, with the text that it was read from.
-    ///
-    /// # Errors
-    /// When the system refuses.
-    pub fn next_with_text(&mut self) -> Result<Option<(Line, &[u8])>, RecordError> {
         loop {
             let read = self.read_one()?;
             match (read, Line::parse(&self.buffer)) {
-                (Found::Whole | Found::Last, Ok(line)) => return Ok(Some((line, &self.buffer))),
+                (Found::Whole | Found::Last, Ok(line)) => return Ok(Some(line)),
                 (Found::Whole, Err(_)) => self.broken += 1,
                 // Torn, or nothing: the end of the file.
                 (Found::Last | Found::Nothing, _) => return Ok(None),
