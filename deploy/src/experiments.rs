@@ -61,6 +61,13 @@ pub fn load(experiment: &str, settings: &[String]) -> Result<Experiment, Failure
     if let Some((name, text)) = EXPERIMENTS.iter().find(|(name, _)| *name == experiment) {
         return Ok(Experiment { name: (*name).to_owned(), config: resolve(text, name, &settings)? });
     }
+    if let Some(set) = rit_env::registered().into_iter().find(|set| set.to_string() == experiment) {
+        let text = format!("environment.task_set = \"{set}\"");
+        return Ok(Experiment {
+            name: experiment.to_owned(),
+            config: resolve(&text, experiment, &settings)?,
+        });
+    }
     let path = Path::new(experiment);
     if path.extension().is_none_or(|extension| extension != "toml") {
         return Err(unknown(experiment));
@@ -108,12 +115,14 @@ pub fn print() -> Result<ExitCode, Failure> {
     let experiments = EXPERIMENTS.map(|(name, text)| {
         format!("  {name:38} {}\n", text.lines().next().unwrap_or_default().trim_start_matches("# "))
     });
+    let own = rit_env::registered().into_iter();
+    let own = own.map(|set| format!("  {:38} this program's own task set\n", set.to_string()));
     let algorithms = Method::ALL.map(Method::facts);
     let algorithms = algorithms.map(|facts| format!("  {:38} {}\n", facts.name, facts.summary));
     output::print(&format!(
         "experiments: task sets with their settings, `rit train EXPERIMENT`\n{}\nalgorithms: any of them on any task set, \
          `rit train EXPERIMENT --algorithm NAME`\n{}",
-        experiments.concat(),
+        experiments.into_iter().chain(own).collect::<String>(),
         algorithms.concat()
     ))?;
     Ok(ExitCode::SUCCESS)

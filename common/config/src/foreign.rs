@@ -129,15 +129,17 @@ pub(crate) fn task_set(environment: &Environment) -> Result<TaskSet, ConfigError
             if spec.n_agents == 0 || spec.n_entities < spec.n_agents || spec.feature_dim == 0 {
                 return Err(ConfigError::WorldSizes { task: keys::quoted(name) });
             }
-            Ok(ForeignTask { name: name.clone(), spec })
+            Ok(ForeignTask { name: name.clone(), spec, maker: None })
         };
         names.iter().map(task).collect::<Result<Vec<_>, ConfigError>>()
     };
     let set = ForeignSet {
+        name: PYTHON.to_owned(),
         training: tasks(training_tasks)?,
         testing: tasks(testing_tasks)?,
         feature_names: feature_names.clone(),
         action_names: action_names.clone(),
+        maker: None,
     };
     if set.training.is_empty() {
         return Err(ConfigError::NoTrainingTasks);

@@ -39,10 +39,10 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
     }
     merge(&mut all, typed);
     let mut config: Config = all.try_into().map_err(|error| wrong_value(&error))?;
-    if matches!(task_set, TaskSet::Foreign(_)) {
+    if task_set.is_python() {
         config.environment.task_set = foreign::task_set(&config.environment)?;
-        config.dims().validate()?;
     }
+    config.dims().validate()?;
     for (key, value, min, max) in config.limits() {
         value.check(key, min, max)?;
     }
@@ -330,7 +330,7 @@ pub(crate) fn merge(below: &mut Table, above: Table) {
 }
 
 fn task_set(typed: &Table) -> Result<TaskSet, ConfigError> {
-    let known = || TaskSet::ALL.map(|set| set.to_string()).join(", ");
+    let known = || TaskSet::known().iter().map(TaskSet::to_string).collect::<Vec<_>>().join(", ");
     let name = typed.get("environment").and_then(|section| section.get("task_set")).and_then(Value::as_str);
     name.ok_or_else(|| ConfigError::NoTaskSet { known: known() })?.parse().map_err(ConfigError::Name)
 }

@@ -1,12 +1,18 @@
-//! Tasks whose worlds are not of this crate: what they are is part of the run's configuration.
+//! Tasks whose worlds are not of this crate: a run's configuration says what they are, or the program that registered
+//! them.
 
-use crate::{Environment, EnvironmentError, FailureKind, Spec, Split, Step};
+use crate::{
+    Environment, EnvironmentError, FailureKind, PYTHON, Spec, Split, Step,
+    own::{self, Held, Maker},
+};
 use rit_episode::{Action, Observation, Rng};
 use std::sync::{Mutex, PoisonError};
 
 /// The tasks of a run whose worlds others made.
 #[derive(Debug, PartialEq, Eq, Hash)]
 pub struct ForeignSet {
+    /// What it is called.
+    pub name: String,
     /// Tasks to learn from.
     pub training: Vec<ForeignTask>,
     /// Tasks kept for zero-shot evaluation.
@@ -15,6 +21,8 @@ pub struct ForeignSet {
     pub feature_names: Vec<String>,
     /// What actions are called.
     pub action_names: Vec<String>,
+    /// Makes their worlds in this process; `None` where they are elsewhere.
+    pub maker: Option<Maker>,
 }
 
 /// One of them.
@@ -24,17 +32,24 @@ pub struct ForeignTask {
     pub name: String,
     /// What it is.
     pub spec: Spec,
+    /// Makes its world in this process; `None` where it is elsewhere.
+    pub maker: Option<Maker>,
 }
 
-/// Before a configuration says which tasks there are.
-pub(crate) static NO_TASKS: ForeignSet = ForeignSet {
-    training: Vec::new(),
-    testing: Vec::new(),
-    feature_names: Vec::new(),
-    action_names: Vec::new(),
-};
-
 impl ForeignSet {
+    /// Environments in Python, before a configuration says which tasks there are.
+    pub(crate) fn unknown_python() -> &'static Self {
+        let set = Self {
+            name: PYTHON.to_owned(),
+            training: Vec::new(),
+            testing: Vec::new(),
+            feature_names: Vec::new(),
+            action_names: Vec::new(),
+            maker: None,
+        };
+        set.kept()
+    }
+
     /// The set that is equal to this one and lives as long as the process: a task can then be copied like any other. Each
     /// set that differs takes memory once.
     pub fn kept(self) -> &'static Self {
@@ -55,20 +70,48 @@ impl ForeignSet {
             Split::Testing => &self.testing,
         }
     }
+
+    /// A task that no list of a set in this process names, if its maker knows it. As [`Self::kept`], each takes memory once.
+    pub(crate) fn unlisted(&self, name: &str) -> Option<&'static ForeignTask> {
+        static KEPT: Mutex<Vec<&'static ForeignTask>> = Mutex::new(Vec::new());
+        let maker = self.maker?;
+        let mut kept = KEPT.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(known) = kept.iter().find(|known| known.name == name && known.maker == Some(maker)) {
+            return Some(known);
+        }
+        let sizes = [self.feature_names.len(), self.action_names.len()];
+        let new: &'static ForeignTask = Box::leak(Box::new(own::described(maker, name, sizes).ok()??));
+        kept.push(new);
+        Some(new)
+    }
 }
 
-/// The world of such a task where no factory makes one: it says so.
+impl ForeignTask {
+    /// Its world.
+    pub(crate) fn world(&'static self) -> Box<dyn Environment> {
+        let elsewhere = || EnvironmentError {
+            kind: FailureKind::Raised,
+            detail: format!("the world of {} is not one of this program's own", self.name),
+        };
+        let made = self.maker.ok_or_else(elsewhere).and_then(|maker| Held::make(maker, &self.name));
+        match made {
+            Ok(world) => Box::new(world),
+            Err(error) => Box::new(Nowhere(self.spec, error)),
+        }
+    }
+}
+
+/// The world of a task that cannot be made: it says so.
 #[derive(Debug)]
-pub(crate) struct Nowhere(pub(crate) &'static ForeignTask);
+struct Nowhere(Spec, EnvironmentError);
 
 impl Environment for Nowhere {
     fn spec(&self) -> Spec {
-        self.0.spec
+        self.0
     }
 
     fn reset(&mut self, _: &mut Rng) -> Result<(), EnvironmentError> {
-        let detail = format!("the world of {} is not one of this program's own", self.0.name);
-        Err(EnvironmentError { kind: FailureKind::Raised, detail })
+        Err(self.1.clone())
     }
 
     fn observe(&self, _: &mut Observation) {}
@@ -85,13 +128,16 @@ mod tests {
     #[test]
     fn equal_sets_are_one_and_the_same() {
         let set = |name: &str| {
-            let task = ForeignTask { name: name.to_owned(), spec: crate::matrix_game::MatrixGame::SPEC };
+            let spec = crate::matrix_game::MatrixGame::SPEC;
+            let task = ForeignTask { name: name.to_owned(), spec, maker: None };
             let names = || vec!["x".to_owned()];
             ForeignSet {
+                name: PYTHON.to_owned(),
                 training: vec![task],
                 testing: vec![],
                 feature_names: names(),
                 action_names: names(),
+                maker: None,
             }
         };
         assert!(std::ptr::eq(set("two").kept(), set("two").kept()));

@@ -3,8 +3,9 @@
 use crate::{
     Environment, EnvironmentOptions, Spec, UnknownName,
     combat::{Combat, CombatSet, Team, TeamError, translation::Translation},
-    foreign::{ForeignSet, ForeignTask, NO_TASKS, Nowhere},
+    foreign::{ForeignSet, ForeignTask},
     matrix_game::MatrixGame,
+    own,
     particle::{CooperativeNavigation, DIRECTIONS, PredatorPrey, PredatorPreyReward},
 };
 use rit_episode::{Action, Dims, wire::TaskSize};
@@ -29,7 +30,7 @@ pub enum TaskSet {
     PredatorPreyPro,
     /// StarCraft micro-combat.
     Combat(CombatSet),
-    /// Tasks whose worlds others made; a run's configuration says which there are.
+    /// Tasks whose worlds others made: a Python function, or a program that registers them.
     Foreign(&'static ForeignSet),
 }
 
@@ -119,6 +120,16 @@ impl TaskSet {
         Self::Combat(CombatSet::ColossiStalkersZealots),
     ];
 
+    /// Every task set that this program knows by name, those that it has registered last.
+    pub fn known() -> Vec<Self> {
+        [Self::ALL.to_vec(), own::registered()].concat()
+    }
+
+    /// Whether its worlds are in Python.
+    pub fn is_python(self) -> bool {
+        matches!(self, Self::Foreign(set) if set.maker.is_none())
+    }
+
     /// The tasks of one split, in a fixed order: a task's index is its place among the training tasks.
     pub fn tasks(self, split: Split) -> Vec<Task> {
         match (self, split) {
@@ -163,7 +174,8 @@ impl TaskSet {
             Ok(Task::PredatorPrey { predators, prey, reward })
         };
         match self {
-            Self::MatrixGame | Self::Foreign(_) => Err(unknown.into()),
+            Self::MatrixGame => Err(unknown.into()),
+            Self::Foreign(set) => set.unlisted(name).map(Task::Foreign).ok_or(unknown.into()),
             Self::CooperativeNavigation => match sizes("navigation") {
                 Some((n, landmarks)) if n == landmarks => {
                     Ok(Task::CooperativeNavigation { n: in_range(n, "agents")? })
@@ -246,7 +258,7 @@ impl Task {
             Self::Combat { set, allies, enemies } => {
                 Box::new(Combat::new(set, [allies, enemies], options.combat))
             }
-            Self::Foreign(task) => Box::new(Nowhere(task)),
+            Self::Foreign(task) => task.world(),
         }
     }
 
@@ -287,7 +299,7 @@ impl fmt::Display for TaskSet {
             Self::PredatorPrey => "predator-prey",
             Self::PredatorPreyPro => "predator-prey-pro",
             Self::Combat(set) => return set.fmt(f),
-            Self::Foreign(_) => PYTHON,
+            Self::Foreign(set) => &set.name,
         })
     }
 }
@@ -330,9 +342,9 @@ impl FromStr for TaskSet {
 
     fn from_str(name: &str) -> Result<Self, UnknownName> {
         if name == PYTHON {
-            return Ok(Self::Foreign(&NO_TASKS));
+            return Ok(Self::Foreign(ForeignSet::unknown_python()));
         }
-        UnknownName::look_up("task set", name, &Self::ALL)
+        UnknownName::look_up("task set", name, &Self::known())
     }
 }
 

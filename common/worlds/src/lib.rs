@@ -16,7 +16,7 @@ pub type Unavailable = StarCraftError;
 
 /// The factory of a configuration's worlds. Nothing is started before the first world is needed.
 pub fn factory(config: &Config) -> Arc<dyn EnvironmentFactory> {
-    if matches!(config.environment.task_set, TaskSet::Foreign(_)) {
+    if config.environment.task_set.is_python() {
         return Arc::new(PythonWorlds::new(Launch::of(&config.environment)));
     }
     match games(config) {
