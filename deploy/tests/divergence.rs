@@ -33,7 +33,7 @@ fn a_run_that_diverges_fails_and_its_last_checkpoint_stays_usable() {
     assert!(stderr.contains("--set algorithm.lr="), "{stderr}");
     let summary: Value =
         serde_json::from_slice(&std::fs::read(run_dir.join("summary.json")).unwrap()).unwrap();
-    assert_eq!(summary["ended"], "failed");
+    assert_eq!((&summary["ended"], &summary["diverged"]), (&"failed".into(), &true.into()));
     let evaluated = output(&["evaluate", "--run", run_dir.to_str().unwrap(), "--episodes", "2", "--json"]);
     assert!(evaluated.status.success(), "{}", String::from_utf8_lossy(&evaluated.stderr));
     let evaluation: Value = serde_json::from_slice(&evaluated.stdout).unwrap();

@@ -213,7 +213,9 @@ impl Trainer {
         });
         if let Err(error) = &finished {
             (self.news)(News::Ending);
-            let summary = Summary { reason: Some(error.to_string()), ..self.summary(Ended::Failed) };
+            let diverged = matches!(error, TrainError::NotFinite { .. });
+            let reason = Some(error.to_string());
+            let summary = Summary { reason, diverged, ..self.summary(Ended::Failed) };
             // A disk that refuses has been complained of.
             let _ = summary.write(&self.run_dir);
         }

@@ -27,6 +27,7 @@ pub use config::{
 };
 pub use error::ConfigError;
 pub use foreign::{PythonAsked, python_answered, python_asked};
+pub use method_keys::family;
 pub use number::{CountError, WHOLE_MAX, count};
 pub use owned_run_dir::OwnedRunDir;
 pub use regular_file::{TEXT_BYTES_MAX, open_regular, read_regular, read_text, write_whole};

@@ -83,8 +83,8 @@ fn preset(method: Method) -> &'static str {
     }
 }
 
-/// Task sets that share their settings.
-fn family(task_set: TaskSet) -> &'static str {
+/// Task sets of one family share their settings.
+pub const fn family(task_set: TaskSet) -> &'static str {
     match task_set {
         TaskSet::MatrixGame => "matrix",
         TaskSet::CooperativeNavigation | TaskSet::PredatorPrey | TaskSet::PredatorPreyPro => "mpe",

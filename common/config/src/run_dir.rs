@@ -225,6 +225,12 @@ impl RunDir {
         run_lock::is_taken(&self.root)
     }
 
+    /// The other host whose process wrote to it last, on a file system that several hosts share: whether that lives, this
+    /// one cannot know.
+    pub fn other_host(&self) -> Option<String> {
+        run_lock::other_host(&self.root)
+    }
+
     /// Where the learner's shared memory is administered: a line of text, written anew by each learner.
     pub fn shared_memory(&self) -> PathBuf {
         self.root.join("shared_memory")

@@ -14,7 +14,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// Who has the lock, a process a line, the one that took it first. Where a file system locks no folders (NFS), the
+/// Who has the lock, a process and its host a line, the one that took it first. Where a file system locks no folders (NFS), the
 /// lock is on this file.
 pub(crate) const LOCK: &str = "lock";
 
@@ -45,7 +45,7 @@ impl RunLock {
             if let Some(locked) = try_lock(root)? {
                 return Ok(Self { locked });
             }
-            let holders = holders(root);
+            let holders = holders_here(root);
             let living = holders.iter().copied().find(|&pid| is_alive(pid));
             let first_lives = living.is_some() && living == holders.first().copied();
             if first_lives || begun.elapsed() >= ORPHANS_TIMEOUT {
@@ -69,7 +69,8 @@ impl RunLock {
         options.create(true).mode(0o600);
         let file = if is_first { options.write(true).truncate(true) } else { options.append(true) };
         // The lock holds without it: only the message is poorer.
-        let _ = open_regular(&root.join(LOCK), file).and_then(|mut file| writeln!(file, "{}", process::id()));
+        let _ = open_regular(&root.join(LOCK), file)
+            .and_then(|mut file| writeln!(file, "{} {}", process::id(), this_host()));
     }
 }
 
@@ -103,12 +104,38 @@ fn try_lock(root: &Path) -> Result<Option<File>, RunDirError> {
 /// Whether a process has the lock of this directory. A look alone: only where a process of the holder's number lives is
 /// the lock itself touched, and given back at once.
 pub(crate) fn is_taken(root: &Path) -> bool {
-    holders(root).into_iter().any(is_alive) && matches!(try_lock(root), Ok(None))
+    holders_here(root).into_iter().any(is_alive) && matches!(try_lock(root), Ok(None))
 }
 
-fn holders(root: &Path) -> Vec<u32> {
+/// The other host whose process had the lock last; nothing where it was one of this host. Of processes there this host
+/// knows nothing, and whether it sees their locks is the file system's affair.
+pub(crate) fn other_host(root: &Path) -> Option<String> {
+    let (_, host) = holders(root).pop()?;
+    host.filter(|host| *host != this_host())
+}
+
+/// Processes with their hosts; of builds that did not say it without.
+fn holders(root: &Path) -> Vec<(u32, Option<String>)> {
     let text = read_text(&root.join(LOCK)).unwrap_or_default();
-    text.lines().filter_map(|line| line.trim().parse().ok()).collect()
+    let holder = |line: &str| {
+        let mut words = line.split_whitespace();
+        Some((words.next()?.parse().ok()?, words.next().map(str::to_owned)))
+    };
+    text.lines().filter_map(holder).collect()
+}
+
+/// Those that may be looked for here.
+fn holders_here(root: &Path) -> Vec<u32> {
+    let (all, here) = (holders(root), this_host());
+    let is_here = |host: &Option<String>| host.as_ref().is_none_or(|host| *host == here);
+    all.into_iter().filter(|(_, host)| is_here(host)).map(|(pid, _)| pid).collect()
+}
+
+/// A word; "unknown" where the system does not say.
+fn this_host() -> String {
+    let name = fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+    let name: String = name.split_whitespace().collect();
+    if name.is_empty() { "unknown".to_owned() } else { name }
 }
 
 /// Whether a process runs; one that was killed and not yet waited for does not.
@@ -136,9 +163,23 @@ mod tests {
             "{error}"
         );
         assert!(error.to_string().contains(&format!("process {}", process::id())), "{error}");
+        assert_eq!(other_host(folder.path()), None);
         drop(lock);
         assert!(!is_taken(folder.path()), "though this process lives");
         RunLock::take(folder.path()).unwrap();
+    }
+
+    #[test]
+    fn of_processes_on_another_host_nothing_is_known_but_the_host() {
+        let folder = tempfile::tempdir().unwrap();
+        let lock = RunLock::take(folder.path()).unwrap();
+        fs::write(folder.path().join(LOCK), format!("{} elsewhere\n", process::id())).unwrap();
+        assert!(!is_taken(folder.path()), "its number is another process' here");
+        assert_eq!(other_host(folder.path()).as_deref(), Some("elsewhere"));
+        // A build that did not say it meant this host.
+        fs::write(folder.path().join(LOCK), format!("{}\n", process::id())).unwrap();
+        assert!(is_taken(folder.path()) && other_host(folder.path()).is_none());
+        drop(lock);
     }
 
     #[test]

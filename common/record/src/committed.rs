@@ -6,7 +6,8 @@
 //! of the testing tasks.
 
 use crate::{
-    Evaluation, Line, Lines, Occasion, RecordError, Summary, TaskResult, record::settings, summary::BYTES_MAX,
+    Evaluation, Line, Lines, Occasion, RecordError, Summary, TaskResult, record::settings, shapley,
+    summary::BYTES_MAX,
 };
 use rit_config::{RunDir, write_whole};
 use serde_json::{Map, Value};
@@ -93,7 +94,8 @@ pub fn commit(root: &Path, stem: &Path) -> Result<[PathBuf; 2], RecordError> {
     if ended.exists() {
         return Err(RecordError::io(ended)(ErrorKind::AlreadyExists.into()));
     }
-    // The second makes it whole: lines without a summary are what a process that was killed has left.
+    shapley::commit(root, stem)?;
+    // The last makes it whole: lines without a summary are what a process that was killed has left.
     write_whole(&metrics, &text).map_err(RecordError::io(&metrics))?;
     write_whole(&ended, &summary).map_err(RecordError::io(&ended))?;
     Ok([metrics, ended])

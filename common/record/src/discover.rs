@@ -4,7 +4,7 @@ use crate::{RecordError, is_header};
 use std::{
     collections::BTreeSet,
     fs::{self, OpenOptions},
-    io::Read as _,
+    io::{ErrorKind, Read as _},
     path::{Path, PathBuf},
 };
 
@@ -52,7 +52,11 @@ fn search(folder: &Path, depth: usize, found: &mut Vec<PathBuf>) -> Result<(), R
         if kind.is_dir() && is_run(&path) {
             found.push(path);
         } else if kind.is_dir() && depth < DEPTH_MAX {
-            search(&path, depth + 1, found)?;
+            match search(&path, depth + 1, found) {
+                // One that may not be looked into holds no runs of this user's.
+                Err(RecordError::Io { error, .. }) if error.kind() == ErrorKind::PermissionDenied => {}
+                searched => searched?,
+            }
         } else if kind.is_file() && path.extension().is_some_and(|it| it == "jsonl") && is_metrics(&path) {
             found.push(path);
         }

@@ -2,8 +2,9 @@
 
 use crate::{
     Best, Build, Ended, Evaluation, Header, Host, Line, Lines, MeasureHelp, Occasion, Progress, RecordError,
-    Run, Summary, TrainingPoint,
+    Run, Shapley, Summary, TrainingPoint,
     committed::{self, Committed},
+    shapley,
 };
 use rit_config::{Config, RunDir, completed, is_free};
 use rit_env::Split;
@@ -63,6 +64,8 @@ pub struct Record {
     pub evaluations: Vec<Evaluation>,
     /// The best policy, where it is kept.
     pub best: Option<Best>,
+    /// Utilities beside Shapley values, for each task that was compared.
+    pub shapley: Vec<Shapley>,
     /// Lines that cannot be read.
     pub broken_lines: usize,
     /// Lines of kinds that this build does not know.
@@ -103,6 +106,7 @@ impl Record {
         let summary = Summary::read(&run_dir).map_err(RecordError::io(run_dir.summary()))?;
         summary.into_iter().for_each(|summary| record.take_summary(summary));
         record.folder = file_name(&record.path);
+        record.shapley = shapley::of_run_dir(root)?;
         Ok(record)
     }
 
@@ -118,6 +122,7 @@ impl Record {
             record.evaluations.push(Evaluation { progress, occasion, split, tasks, ..Evaluation::default() });
         }
         summary.into_iter().for_each(|summary| record.take_summary(summary));
+        record.shapley = shapley::of_committed(metrics)?;
         let stem = metrics.file_stem().unwrap_or_default().to_string_lossy();
         if record.settings.is_empty() {
             record.kind = record.shown_kind();

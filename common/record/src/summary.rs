@@ -72,6 +72,10 @@ impl fmt::Display for Ended {
 /// What the keys of this build's `summary.json` mean. Raise it when that changes.
 const FORMAT_VERSION: u32 = 1;
 
+fn is_false(value: &bool) -> bool {
+    !value
+}
+
 /// Files of builds that did not say it yet mean the same.
 fn first_format() -> u32 {
     1
@@ -89,6 +93,9 @@ pub struct Summary {
     /// Why, if it failed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reason: Option<String>,
+    /// Whether it failed since a loss or gradient was no finite number: it would again.
+    #[serde(default, skip_serializing_if = "is_false")]
+    pub diverged: bool,
     /// How far training came; of a run that failed, where its newest checkpoint is.
     #[serde(flatten)]
     pub progress: Progress,
@@ -132,6 +139,7 @@ impl Default for Summary {
             format_version: FORMAT_VERSION,
             ended: Ended::default(),
             reason: None,
+            diverged: false,
             progress: Progress::default(),
             wall_s: 0.0,
             cpu_s: None,

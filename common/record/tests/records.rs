@@ -5,7 +5,7 @@ use rit_config::{Config, OwnedRunDir, resolve, set};
 use rit_env::Split;
 use rit_record::{
     Build, Cell, CellState, EachEpisode, Ended, Evaluation, Header, Line, Occasion, Progress, Record, Run,
-    Summary, Sweep, TaskResult, TrainingPoint, commit, discover,
+    Shapley, Summary, Sweep, TaskResult, TrainingPoint, commit, discover,
 };
 use std::{
     fs,
@@ -156,6 +156,33 @@ fn a_committed_record_says_what_the_run_directory_said() {
 }
 
 /// Where the repository keeps its results.
+#[test]
+fn what_shapley_values_said_is_kept_with_the_run_and_with_its_committed_record() {
+    let folder = tempfile::tempdir().unwrap();
+    let (root, stem) = (folder.path().join("run"), folder.path().join("rit_gamma-0.8_seed-3"));
+    run(&root, &[]);
+    end(&root, Ended::Finished);
+    let points: Vec<[f64; 2]> = (0..1000).map(|at| [f64::from(at), 0.123_456]).collect();
+    let found = Shapley { task: "navigation-2-2".into(), agents: 2, points, ..Shapley::default() };
+    let earlier = Shapley { agents: 9, ..found.clone() };
+    earlier.keep(&root).unwrap();
+    assert!(found.keep(&root).unwrap().ends_with("shapley/navigation-2-2.json"));
+    Shapley { task: "a/b".into(), mean_shapley: f64::NAN, ..Shapley::default() }.keep(&root).unwrap();
+    let of_run = Record::read(&root).unwrap().shapley;
+    assert_eq!(
+        of_run.iter().map(|it| (it.task.as_str(), it.agents)).collect::<Vec<_>>(),
+        [("a/b", 0), ("navigation-2-2", 2)]
+    );
+    assert!(of_run[0].mean_shapley.is_nan());
+    assert_eq!((of_run[1].points.len(), of_run[1].points[1]), (500, [2.0, 0.1235]));
+    commit(&root, &stem).unwrap();
+    let committed = Record::read(&folder.path().join("rit_gamma-0.8_seed-3.jsonl")).unwrap();
+    assert_eq!((committed.shapley.len(), &committed.shapley[1]), (2, &of_run[1]));
+    fs::write(root.join("shapley/a-b.json"), "{}").unwrap();
+    let error = Record::read(&root).unwrap_err().to_string();
+    assert!(error.contains("a-b.json is no comparison with Shapley values: missing field"), "{error}");
+}
+
 fn results() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/results")
 }
