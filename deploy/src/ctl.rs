@@ -220,11 +220,11 @@ fn status(status: &RunStatus, as_json: bool) -> Result<String, Failure> {
     let mut text = lines.join("\n") + "\n";
     if !status.recent.is_empty() {
         text += "\nexploring episodes of late\n";
-        text += &report::table(&status.recent);
+        text += &report::brief_table(&status.recent, "`rit ctl … --json status` has all");
     }
     if let Some(evaluation) = &status.evaluation {
         text += &format!("\ngreedy evaluation at {} steps\n", grouped(evaluation.env_steps));
-        text += &report::table(&evaluation.tasks);
+        text += &report::brief_table(&evaluation.tasks, "`rit ctl … --json status` has all");
     }
     Ok(text)
 }

@@ -59,16 +59,6 @@ impl Finished {
         }
     }
 
-    /// How it ended.
-    pub fn ended(&self) -> Ended {
-        self.summary.ended
-    }
-
-    /// How far training came.
-    pub fn env_steps(&self) -> u64 {
-        self.summary.progress.env_steps
-    }
-
     /// Why it failed, if it did, after this.
     fn reason(&self, after: &str) -> String {
         let reason = self.summary.reason.as_deref();
@@ -85,7 +75,11 @@ impl Finished {
             report::grouped(progress.updates),
             report::duration(*wall_s),
             // One that failed was not evaluated at its end.
-            if results.is_empty() { String::new() } else { report::table(&results) },
+            if results.is_empty() {
+                String::new()
+            } else {
+                report::brief_table(&results, "summary.json has all")
+            },
             weights_digest.as_ref().map_or_else(String::new, |digest| format!("weights digest {digest}\n")),
             self.root.display()
         )

@@ -6,6 +6,48 @@ use std::{
     fmt::Write as _,
 };
 
+/// Tasks that are listed one by one where nobody has asked for them.
+pub const TASKS_MAX: usize = 10;
+/// Of more, so many of the lowest and of the highest are.
+const ENDS: usize = 3;
+
+/// The mean over tasks, each counting the same; its episodes are all of theirs.
+pub fn mean(results: &[TaskResult]) -> TaskResult {
+    let count = results.len().max(1) as f64;
+    let wins: Option<f64> = results.iter().map(|result| result.win_rate).sum();
+    let total = |of: fn(&TaskResult) -> Option<u64>| results.iter().map(of).sum::<Option<u64>>();
+    TaskResult {
+        task: format!("mean of {} tasks", results.len()),
+        episodes: results.iter().map(|result| result.episodes).sum(),
+        mean_return: results.iter().map(|result| result.mean_return).sum::<f64>() / count,
+        win_rate: wins.map(|wins| wins / count),
+        episodes_total: total(|result| result.episodes_total),
+        ..TaskResult::default()
+    }
+}
+
+/// All of few tasks; of many the lowest and the highest, by win rate where there is one.
+pub fn ends(results: &[TaskResult]) -> Vec<&TaskResult> {
+    let mut all: Vec<&TaskResult> = results.iter().collect();
+    if all.len() > TASKS_MAX {
+        let key = |result: &TaskResult| (result.win_rate.unwrap_or(0.0), result.mean_return);
+        all.sort_by(|a, b| key(a).0.total_cmp(&key(b).0).then(key(a).1.total_cmp(&key(b).1)));
+        all.drain(ENDS..all.len() - ENDS);
+    }
+    all
+}
+
+/// As [`table`] for few tasks; of many the mean, the lowest and the highest, and `whole`: where all are.
+pub fn brief_table(results: &[TaskResult], whole: &str) -> String {
+    if results.len() <= TASKS_MAX {
+        return table(results);
+    }
+    let mut shown = vec![mean(results)];
+    shown.extend(ends(results).into_iter().cloned());
+    let left = results.len() + 1 - shown.len();
+    format!("{}{left} tasks between these three and those: {whole}\n", table(&shown))
+}
+
 /// One line a task: name, mean return, win rate where there is one.
 pub fn table(results: &[TaskResult]) -> String {
     let width = results.iter().map(|result| result.task.len()).max().unwrap_or(0).max("task".len());
@@ -23,12 +65,10 @@ pub fn in_words(results: &[TaskResult]) -> Option<String> {
     if results.is_empty() {
         return None;
     }
-    let count = results.len() as f64;
-    let mean = results.iter().map(|result| result.mean_return).sum::<f64>() / count;
-    let wins: Option<f64> = results.iter().map(|result| result.win_rate).sum();
-    Some(match wins {
-        Some(wins) => format!("return {mean:.1}, win rate {:.2}", wins / count),
-        None => format!("return {mean:.1}"),
+    let TaskResult { mean_return, win_rate, .. } = mean(results);
+    Some(match win_rate {
+        Some(win_rate) => format!("return {mean_return:.1}, win rate {win_rate:.2}"),
+        None => format!("return {mean_return:.1}"),
     })
 }
 
@@ -75,6 +115,7 @@ pub fn line(line: &MetricsLine) -> String {
         vec![format!("{} steps", grouped(line.env_steps)), format!("{} updates", grouped(line.updates))];
     parts.extend(in_words(&line.tasks).map(|words| match line.training {
         Some(_) => words,
+        None if line.testing => format!("zero-shot: {words}"),
         None => format!("greedy: {words}"),
     }));
     if let Some(training) = &line.training {
@@ -167,6 +208,33 @@ mod tests {
         assert_eq!(printable("actor-0"), "actor-0");
         assert_eq!(printable("a\u{1b}[31m\nb\u{9b}c"), "a\u{fffd}[31m\u{fffd}b\u{fffd}c");
         assert_eq!(printable(&"ä".repeat(60_000)).chars().count(), 201);
+    }
+
+    #[test]
+    fn of_many_tasks_the_mean_comes_first_then_the_lowest_and_the_highest() {
+        let result = |at: u64| TaskResult {
+            task: format!("{at}z"),
+            episodes: 2,
+            mean_return: at as f64,
+            win_rate: Some(1.0 - at as f64 / 100.0),
+            ..TaskResult::default()
+        };
+        let results: Vec<TaskResult> = (0..11).map(result).collect();
+        let text = brief_table(&results, "`there`");
+        let names: Vec<&str> = text.lines().skip(1).filter_map(|line| line.split("  ").next()).collect();
+        let between = "5 tasks between these three and those: `there`";
+        assert_eq!(names, ["mean of 11 tasks", "10z", "9z", "8z", "2z", "1z", "0z", between]);
+        assert!(text.contains("mean of 11 tasks        22         5.00     0.950"), "{text}");
+        assert_eq!(brief_table(&results[..10], ""), table(&results[..10]));
+    }
+
+    #[test]
+    fn a_line_says_whether_its_tasks_were_ever_trained_on() {
+        let result = TaskResult { mean_return: 2.0, ..TaskResult::default() };
+        let mut metrics = MetricsLine { env_steps: 1000, tasks: vec![result], ..MetricsLine::default() };
+        assert_eq!(line(&metrics), "1 000 steps · 0 updates · greedy: return 2.0");
+        metrics.testing = true;
+        assert_eq!(line(&metrics), "1 000 steps · 0 updates · zero-shot: return 2.0");
     }
 
     #[test]

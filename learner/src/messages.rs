@@ -1,6 +1,7 @@
 //! What a run leaves, as messages: the same numbers that stand in its files.
 
 use rit_algo::learner::Measure;
+use rit_env::Split;
 use rit_proto::v1;
 use rit_record::{Evaluation, Line, Measured, TaskResult, TrainingPoint};
 
@@ -29,12 +30,14 @@ pub fn measures(measured: &Measured, measures: &[Measure]) -> Vec<v1::Measure> {
 
 /// A line of metrics; nothing for one of a kind that this build does not know.
 pub fn line(line: &Line) -> Option<v1::MetricsLine> {
-    let (progress, wall_s, tasks, training) = match line {
+    let (progress, wall_s, tasks, training, split) = match line {
         Line::Training(TrainingPoint { progress, wall_s, epsilon, tasks, measured }) => {
             let training = v1::Training { epsilon: *epsilon, measures: measures(measured, &[]) };
-            (progress, wall_s, tasks, Some(training))
+            (progress, wall_s, tasks, Some(training), Split::Training)
         }
-        Line::Evaluation(Evaluation { progress, wall_s, tasks, .. }) => (progress, wall_s, tasks, None),
+        Line::Evaluation(Evaluation { progress, wall_s, tasks, split, .. }) => {
+            (progress, wall_s, tasks, None, *split)
+        }
         Line::Other(_) => return None,
     };
     Some(v1::MetricsLine {
@@ -44,6 +47,7 @@ pub fn line(line: &Line) -> Option<v1::MetricsLine> {
         wall_s: *wall_s,
         tasks: tasks.values().map(task_result).collect(),
         training,
+        testing: split == Split::Testing,
     })
 }
 

@@ -1,7 +1,7 @@
 //! How a run looks on a terminal.
 
 use super::model::{Curve, Model};
-use crate::report::{duration, grouped, printable, reasons, state, time_left, words};
+use crate::report::{TASKS_MAX, duration, ends, grouped, mean, printable, reasons, state, time_left, words};
 use ratatui::{
     Frame,
     layout::{Constraint, Layout, Rect},
@@ -18,7 +18,7 @@ pub fn draw(frame: &mut Frame<'_>, model: &Model) {
     let [head, bar, tasks, numbers, curves, actors, ledger, happenings] = Layout::vertical([
         rows(1),
         rows(2),
-        rows(status.recent.len() + 2),
+        rows(task_rows(status).len() + 2),
         rows(3),
         rows(model.curves.len() + 1),
         rows(status.actors.len() + 2),
@@ -70,17 +70,27 @@ fn progress(status: &RunStatus) -> Gauge<'static> {
     Gauge::default().ratio(share.clamp(0.0, 1.0)).label(label).gauge_style(Style::new().blue().on_dark_gray())
 }
 
+/// Exploring and greedy results, task by task; of many tasks the mean, the lowest and the highest.
+fn task_rows(status: &RunStatus) -> Vec<(TaskResult, Option<TaskResult>)> {
+    let evaluated = status.evaluation.as_ref().map(|evaluation| &evaluation.tasks[..]).unwrap_or_default();
+    let greedy = |task: &str| evaluated.iter().find(|result| result.task == task).cloned();
+    let of_task = |result: &TaskResult| (result.clone(), greedy(&result.task));
+    let mut rows: Vec<_> = ends(&status.recent).into_iter().map(of_task).collect();
+    if status.recent.len() > TASKS_MAX {
+        rows.insert(0, (mean(&status.recent), (!evaluated.is_empty()).then(|| mean(evaluated))));
+    }
+    rows
+}
+
 fn task_table(status: &RunStatus) -> Table<'static> {
-    let greedy = |task: &str| status.evaluation.as_ref()?.tasks.iter().find(|result| result.task == task);
     let share = |rate: Option<f64>| rate.map_or_else(|| "-".to_owned(), |rate| format!("{rate:.2}"));
-    let rows = status.recent.iter().map(|result: &TaskResult| {
-        let greedy = greedy(&result.task);
+    let rows = task_rows(status).into_iter().map(|(result, greedy)| {
         let number = |count: Option<u64>| count.map_or_else(|| "-".to_owned(), grouped);
         Row::new([
             result.task.clone(),
             format!("{:.2}", result.mean_return),
             share(result.win_rate),
-            greedy.map_or_else(|| "-".to_owned(), |greedy| format!("{:.2}", greedy.mean_return)),
+            greedy.as_ref().map_or_else(|| "-".to_owned(), |greedy| format!("{:.2}", greedy.mean_return)),
             share(greedy.and_then(|greedy| greedy.win_rate)),
             number(result.episodes_total),
             number(result.policy_lag),

@@ -7,11 +7,15 @@ import { followLog, showLedger, showProcesses, showTiles, showWarnings } from ".
 import { byId, duration, grouped, make, short } from "./text.js";
 
 const NOTE_MS = 8000;
+/** So many tasks have a line each; of more their mean is drawn, and tasks that are asked for. */
+const TASKS_MAX = 6;
 
 const run = await get("/api/run");
 const episode = new EpisodeView(run, (text) => note(text, "bad"));
-/** Lines of metrics.jsonl by kind. */
-const lines = { training: [], evaluation: [] };
+/** Lines of metrics.jsonl by kind; `testing` are evaluations of tasks that are never trained on. */
+const lines = { training: [], evaluation: [], testing: [] };
+/** Tasks that are drawn beside the mean: name and colour. */
+const shown = new Map();
 let link = "lost";
 let status = null;
 
@@ -34,14 +38,19 @@ const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).v
 
 function drawCurves() {
   const [kind, measure] = [chosen("kind"), chosen("measure")];
-  const names = run.training_tasks;
-  const series = names.map((name, colour) => ({
+  const names = kind === "testing" ? run.testing_tasks : run.training_tasks;
+  const of = (name, colour) => ({
     name,
     colour,
     points: lines[kind].filter(({ tasks }) => tasks[name]).map(({ env_steps, tasks }) => [env_steps, tasks[name][measure]]),
-  }));
+  });
+  const many = names.length > TASKS_MAX;
+  const series = many
+    ? [meanOf(names, lines[kind], measure), ...names.filter((name) => shown.has(name)).map((name) => of(name, shown.get(name)))]
+    : names.map(of);
   curve.range = measure === "win_rate" ? [0, 1] : null;
-  curve.show(series, kind === "evaluation" ? "The first evaluation is still to come" : "The first point is still to come");
+  curve.show(series, kind === "training" ? "The first point is still to come" : "The first evaluation is still to come");
+  showTaskList(many ? names : [], lines[kind].at(-1)?.tasks ?? {}, measure);
   byId("curve-legend").replaceChildren(
     ...series.map(({ name, colour, points }) =>
       make("li", {}, make("i", { class: `swatch c${colour}` }), name, make("b", {}, points.length ? short(points.at(-1)[1]) : "–")),
@@ -49,10 +58,56 @@ function drawCurves() {
   );
 }
 
+/** The mean over the tasks that a line has. */
+function meanOf(names, points, measure) {
+  const mean = ({ tasks }) => {
+    const values = names.filter((name) => tasks[name]).map((name) => tasks[name][measure]);
+    return values.reduce((sum, value) => sum + value, 0) / values.length;
+  };
+  const there = points.filter(({ tasks }) => names.some((name) => tasks[name]));
+  return { name: `mean of ${names.length} tasks`, colour: 0, points: there.map((line) => [line.env_steps, mean(line)]) };
+}
+
+/** Each of many tasks with its newest value; those that are ticked are drawn, as many as there are colours. */
+function showTaskList(names, newest, measure) {
+  byId("curve-tasks").hidden = names.length === 0;
+  const list = byId("curve-task-list");
+  if (list.dataset.names !== names.join()) {
+    list.dataset.names = names.join();
+    list.replaceChildren(...names.map((name) => make("li", {}, make("label", {}, tick(name), ` ${name} `, make("b", {})))));
+  }
+  const full = shown.size >= TASKS_MAX - 1;
+  for (const [at, name] of names.entries()) {
+    const item = list.children[at];
+    const box = item.querySelector("input");
+    box.checked = shown.has(name);
+    box.disabled = full && !box.checked;
+    item.querySelector("b").textContent = newest[name] ? short(newest[name][measure]) : "–";
+  }
+}
+
+function tick(name) {
+  const box = make("input", { type: "checkbox" });
+  box.addEventListener("change", () => {
+    const taken = new Set(shown.values());
+    const free = [...Array(TASKS_MAX).keys()].find((colour) => colour > 0 && !taken.has(colour));
+    if (!box.checked) shown.delete(name);
+    else if (free) shown.set(name, free);
+    drawCurves();
+  });
+  return box;
+}
+
 function drawSmall() {
   for (const { key, name, chart } of small) {
     chart.show([{ name, colour: 0, points: lines.training.map((line) => [line.env_steps, line[key]]) }], "–");
   }
+}
+
+/** Among what it is drawn; nothing for evaluations of the best weights, which are no point of a curve. */
+function kindOf({ kind, split, occasion }) {
+  if (occasion === "best") return null;
+  return kind === "evaluation" && split === "testing" ? "testing" : kind;
 }
 
 function redraw() {
@@ -160,7 +215,8 @@ function showEvaluation({ env_steps, weights_version, tasks }) {
 function setUpCurves() {
   for (const [name, standard] of [["kind", "training"], ["measure", "mean_return"]]) {
     const stored = localStorage.getItem(name);
-    const radios = [...document.querySelectorAll(`input[name=${name}]`)];
+    const isThere = ({ value }) => value !== "testing" || run.testing_tasks.length > 0;
+    const radios = [...document.querySelectorAll(`input[name=${name}]`)].filter(isThere);
     const first = radios.find(({ value }) => value === stored) ?? radios.find(({ value }) => value === standard);
     first.checked = true;
     for (const radio of radios) {
@@ -170,6 +226,7 @@ function setUpCurves() {
       });
     }
   }
+  byId("kind-testing").hidden = run.testing_tasks.length === 0;
   if (run.has_wins) byId("curve-measure").hidden = false;
   else document.querySelector("input[value=mean_return]").checked = true;
 }
@@ -187,9 +244,10 @@ listen({
   reset() {
     lines.training = [];
     lines.evaluation = [];
+    lines.testing = [];
   },
   metrics(news) {
-    for (const line of news) lines[line.kind]?.push(line);
+    for (const line of news) lines[kindOf(line)]?.push(line);
     redraw();
   },
   status(news) {
