@@ -10,6 +10,8 @@ use std::{
 
 /// What a report's folder holds, and nothing else.
 const ENTRIES: [&str; 5] = ["index.html", "marl-eval.json", "runs.csv", "figures", "tables"];
+/// What of it is large, and in the page or in the records already.
+const DATA: [&str; 3] = ["marl-eval.json", "runs.csv", "figures"];
 
 /// `rit report`.
 ///
@@ -27,7 +29,10 @@ pub fn run(options: &ReportOptions) -> Result<ExitCode, Failure> {
     };
     let (groups, unfinished) = finished(&input, &settings)?;
     let more = vec![representations::section(&groups, options.seed)?];
-    let made = report(&input, &groups, &unfinished, &settings, more)?;
+    let mut made = report(&input, &groups, &unfinished, &settings, more)?;
+    if options.without_data {
+        made.files.retain(|(path, _)| !DATA.iter().any(|entry| path.starts_with(entry)));
+    }
     write(&made, &options.out)?;
     let place = options.out.display();
     if options.json {

@@ -9,7 +9,8 @@ use rit_env::Split;
 use rit_report::{
     Group, Measure, Options, Styles,
     chart::{self, Chart},
-    figures, groups, read,
+    figures::{self, Drawn},
+    groups, read,
 };
 use std::process::ExitCode;
 
@@ -44,7 +45,7 @@ pub fn run(options: &PlotOptions) -> Result<ExitCode, Failure> {
     } else {
         let chart = |group: &Group| {
             let methods: Vec<_> = group.methods.iter().collect();
-            figures::chart(group, &methods, Split::Training, &styles)
+            figures::chart(group, &methods, Split::Training, Drawn::MeanAndInterval, &styles)
         };
         groups.iter().map(chart).collect()
     };
@@ -58,7 +59,7 @@ fn by_task(group: &Group, styles: &Styles) -> Vec<Chart> {
     let of_task = |task: &String| {
         let alone = Group { training: vec![task.clone()], title: task.clone(), ..group.clone() };
         let methods: Vec<_> = alone.methods.iter().collect();
-        figures::chart(&alone, &methods, Split::Training, styles)
+        figures::chart(&alone, &methods, Split::Training, Drawn::MeanAndInterval, styles)
     };
     group.training.iter().map(of_task).collect()
 }

@@ -144,8 +144,7 @@ fn table(tasks: &[TaskPoints], id: &str, whose: &str) -> Table {
         rows: tasks.iter().enumerate().map(row).collect(),
         note: "Silhouette: 1 where a task's representations lie far from all others', 0 where they lie between, −1 where \
                they lie among another task's. In parentheses: distance between the tasks' mean representations."
-            .to_owned(),
-    }
+            .to_owned(), ..Table::default() }
 }
 
 fn centre(points: &[Vec<f32>]) -> Vec<f32> {

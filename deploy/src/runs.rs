@@ -1,25 +1,20 @@
 //! `rit runs`: which runs there are, how they stand, and what they have reached.
 
-use crate::{cli::RunsOptions, failure::Failure, finished::Finished, output, report};
+use crate::{cli::RunsOptions, failure::Failure, output, report};
 use rit_config::RunDir;
 use rit_env::Split;
-use rit_record::{Evaluation, Line, Lines, Occasion};
+use rit_record::{Occasion, Record, RecordError, discover};
 use serde::Serialize;
-use std::{
-    fs,
-    path::{Path, PathBuf},
-    process::ExitCode,
-};
-
-/// Folders within folders that are looked into.
-const DEPTH: usize = 4;
+use std::{fs, path::Path, process::ExitCode};
 
 /// `rit runs`.
 pub fn run(options: &RunsOptions) -> Result<ExitCode, Failure> {
-    let mut folders = Vec::new();
     let entries = fs::read_dir(&options.dir);
     entries.map_err(|error| Failure::input_message(format!("{}: {error}", options.dir.display())))?;
-    find(&options.dir, DEPTH, &mut folders);
+    let mut folders = match discover(std::slice::from_ref(&options.dir)) {
+        Err(RecordError::None(_)) => Vec::new(),
+        found => found.map_err(Failure::input)?,
+    };
     folders.sort_by_cached_key(|folder| natural(folder));
     let rows: Vec<Row> = folders.iter().map(|folder| Row::of(folder, &options.dir)).collect();
     if options.json {
@@ -34,7 +29,7 @@ pub fn run(options: &RunsOptions) -> Result<ExitCode, Failure> {
 }
 
 /// A run in the list.
-#[derive(Debug, PartialEq, Serialize)]
+#[derive(Debug, Default, PartialEq, Serialize)]
 struct Row {
     /// Where it lies, from the folder that is listed.
     run: String,
@@ -65,44 +60,35 @@ impl Row {
     fn of(folder: &Path, listed: &Path) -> Self {
         let name = folder.strip_prefix(listed).unwrap_or(folder).display().to_string();
         let run = if name.is_empty() { folder.display().to_string() } else { name };
-        let (run_dir, config) = match RunDir::open(folder) {
-            Ok(opened) => opened,
+        let record = match Record::read(folder) {
+            Ok(record) => record,
             Err(error) => {
-                return Self {
-                    run,
-                    task_set: None,
-                    algorithm: None,
-                    seed: None,
-                    state: "unreadable".to_owned(),
-                    reason: Some(error.to_string()),
-                    env_steps: 0,
-                    t_max: None,
-                    metric: None,
-                    last_evaluation: None,
-                    best_evaluation: None,
-                };
+                let (state, reason) = ("unreadable".to_owned(), Some(error.to_string()));
+                return Self { run, state, reason, ..Self::default() };
             }
         };
-        let (env_steps, evaluations) = read(&run_dir);
-        let finished = if run_dir.is_in_use() { Ok(None) } else { Finished::of(&run_dir) };
-        let state = match &finished {
-            _ if run_dir.is_in_use() => "running",
-            Ok(Some(finished)) => finished.ended().word(),
-            Ok(None) => "broken off",
-            Err(_) => "unreadable",
+        let in_use = RunDir::open(folder).is_ok_and(|(run_dir, _)| run_dir.is_in_use());
+        let state = match record.ended {
+            _ if in_use => "running",
+            Some(ended) => ended.word(),
+            None => "broken off",
         };
-        let (state, reason) = (state.to_owned(), finished.as_ref().err().map(ToString::to_string));
-        let finished = finished.ok().flatten();
+        let scheduled =
+            |it: &&rit_record::Evaluation| (it.occasion, it.split) == (Occasion::Scheduled, Split::Training);
+        let results = |it: &rit_record::Evaluation| {
+            it.tasks.values().map(|result| (result.mean_return, result.win_rate)).collect()
+        };
+        let evaluations: Vec<Results> = record.evaluations.iter().filter(scheduled).map(results).collect();
         let (metric, values) = measured(&evaluations);
         Self {
             run,
-            task_set: Some(config.environment.task_set.to_string()),
-            algorithm: Some(config.algorithm.name.to_string()),
-            seed: Some(config.seed.0),
-            state,
-            reason,
-            env_steps: finished.as_ref().map_or(env_steps, Finished::env_steps),
-            t_max: Some(config.training.t_max),
+            task_set: record.task_set().map(str::to_owned),
+            algorithm: record.method().map(str::to_owned),
+            seed: record.seed,
+            state: state.to_owned(),
+            reason: None,
+            env_steps: record.progress.env_steps,
+            t_max: record.env_steps_max(),
             metric,
             last_evaluation: values.last().copied(),
             best_evaluation: values.into_iter().max_by(f64::total_cmp),
@@ -137,27 +123,6 @@ impl Row {
 
 /// What an evaluation reached on each task: mean return, and win rate where there is one.
 type Results = Vec<(f64, Option<f64>)>;
-
-/// How far a run has come, and its scheduled evaluations of training tasks. One that was killed before its first line has
-/// measured nothing.
-fn read(run_dir: &RunDir) -> (u64, Vec<Results>) {
-    let (mut env_steps, mut evaluations) = (0, Vec::new());
-    let Ok(mut lines) = Lines::open(&run_dir.metrics()) else { return (env_steps, evaluations) };
-    while let Ok(Some(line)) = lines.next_line() {
-        env_steps = line.progress().map_or(env_steps, |progress| progress.env_steps);
-        if let Line::Evaluation(Evaluation {
-            split: Split::Training,
-            occasion: Occasion::Scheduled,
-            tasks,
-            ..
-        }) = line
-        {
-            let results = tasks.into_values().map(|result| (result.mean_return, result.win_rate));
-            evaluations.push(results.collect());
-        }
-    }
-    (env_steps, evaluations)
-}
 
 /// The mean over tasks of each evaluation, and what it measures: win rates where all tasks know them, else returns.
 fn measured(evaluations: &[Results]) -> (Option<&'static str>, Vec<f64>) {
@@ -198,20 +163,6 @@ fn table(rows: &[Row]) -> String {
     text
 }
 
-/// The runs in a folder and, down to a depth, in folders of it.
-fn find(folder: &Path, depth: usize, found: &mut Vec<PathBuf>) {
-    if folder.join("config.toml").exists() && folder.join("run_id").exists() {
-        found.push(folder.to_owned());
-        return;
-    }
-    // Folders that may not be looked into hold no runs of this user's.
-    for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
-        if depth > 0 && entry.file_type().is_ok_and(|kind| kind.is_dir()) {
-            find(&entry.path(), depth - 1, found);
-        }
-    }
-}
-
 /// A path to sort by, so that run-10 comes after run-9.
 fn natural(path: &Path) -> Vec<(String, u64)> {
     let text = path.display().to_string();
@@ -230,6 +181,7 @@ fn natural(path: &Path) -> Vec<(String, u64)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::path::PathBuf;
 
     #[test]
     fn runs_are_in_the_order_of_their_numbers() {

@@ -1,5 +1,5 @@
-//! `rit serve`: a folder of runs or a sweep in a browser of this machine. What can be seen is read anew for each request,
-//! so a sweep that still runs fills up as one looks.
+//! `rit serve`: a folder of runs or a sweep in a browser of this machine. Each request looks for what has changed, so a
+//! sweep that still runs fills up as one looks; runs whose files have not changed are not read again.
 
 use crate::{cli::ServeOptions, failure::Failure, output, player::Trained, render, shutdown};
 use axum::{
@@ -17,14 +17,22 @@ use rit_learner::{
     trainer::evaluation_seed,
     web::{Door, Gate, Home, guarded},
 };
-use rit_record::Record;
+use rit_record::{Record, RecordError};
 use rit_report::{
-    CSS, Figure, Group, Input, Options, ReportError, Section, Styles, Table, chart, figures, groups, page,
-    read,
+    CSS, Figure, Group, Input, Options, ReportError, Section, Styles, Table, chart,
+    figures::{self, Drawn},
+    groups, page, read_by,
 };
 use rustix::rand::{GetRandomFlags, getrandom};
 use serde::Deserialize;
-use std::{collections::BTreeSet, path::PathBuf, process::ExitCode, sync::Arc};
+use std::{
+    collections::{BTreeMap, BTreeSet, HashMap},
+    fs,
+    path::{Path, PathBuf},
+    process::ExitCode,
+    sync::{Arc, Mutex, PoisonError},
+    time::SystemTime,
+};
 
 /// Where browsers that are let in are led.
 const RUNS: &str = "/runs";
@@ -36,7 +44,12 @@ const NAME_BYTES: usize = 4;
 struct Shown {
     folder: PathBuf,
     by: Vec<String>,
+    /// Runs that were read, with their files as they were then.
+    known: Mutex<HashMap<PathBuf, (Stamp, Record)>>,
 }
+
+/// Length and time of each file that a record is made from; nothing for one that is not there.
+type Stamp = Vec<Option<(u64, SystemTime)>>;
 
 /// `rit serve`.
 ///
@@ -46,7 +59,7 @@ pub async fn run(options: ServeOptions) -> Result<ExitCode, Failure> {
     let WebListen::On(address) = options.listen else {
         return Err(Failure::input_message("--listen off: write an address, such as 127.0.0.1:8080"));
     };
-    let shown = Shown { folder: options.folder, by: options.by };
+    let shown = Shown { folder: options.folder, by: options.by, known: Mutex::default() };
     shown.read()?;
     let mut bytes = [0; TOKEN_BYTES + NAME_BYTES];
     getrandom(&mut bytes, GetRandomFlags::empty()).map_err(Failure::runtime)?;
@@ -69,7 +82,20 @@ pub async fn run(options: ServeOptions) -> Result<ExitCode, Failure> {
 
 impl Shown {
     fn read(&self) -> Result<Input, ReportError> {
-        read(std::slice::from_ref(&self.folder))
+        read_by(std::slice::from_ref(&self.folder), |path| self.record(path))
+    }
+
+    /// The run of a path, without the lines of training, which no page shows.
+    fn record(&self, path: &Path) -> Result<Record, RecordError> {
+        let known = || self.known.lock().unwrap_or_else(PoisonError::into_inner);
+        // Taken before it is read: what is written meanwhile makes another.
+        let stamp = stamp(path);
+        if let Some((_, record)) = known().get(path).filter(|(then, _)| *then == stamp) {
+            return Ok(record.clone());
+        }
+        let record = Record { training: Vec::new(), ..Record::read(path)? };
+        known().insert(path.to_owned(), (stamp, record.clone()));
+        Ok(record)
     }
 
     /// The run of this number, in the order in which they are found.
@@ -88,6 +114,21 @@ impl Shown {
             _ => run.folder.clone(),
         }
     }
+}
+
+/// Of a run directory, or of a committed record and the folder that has what else is kept of it.
+fn stamp(path: &Path) -> Stamp {
+    let files = if path.is_dir() {
+        ["metrics.jsonl", "config.toml", "summary.json", "shapley"].map(|name| path.join(name)).to_vec()
+    } else {
+        let folder = path.parent().unwrap_or(path);
+        vec![path.to_owned(), path.with_extension("json"), folder.to_owned()]
+    };
+    let of = |path: PathBuf| {
+        let metadata = fs::metadata(path).ok()?;
+        Some((metadata.len(), metadata.modified().ok()?))
+    };
+    files.into_iter().map(of).collect()
 }
 
 /// Why there is no answer.
@@ -143,9 +184,8 @@ async fn all(
             let all = sweep.finished + sweep.missing.len();
             runs.text.push(format!("{} of {all} runs of the sweep are finished.", sweep.finished));
         }
-        runs.tables.push(table(&shown, &input.runs));
-        let links = input.runs.iter().enumerate();
-        runs.links = links.map(|(at, run)| (format!("{RUNS}/{at}"), shown.name(run))).collect();
+        let links = (0..input.runs.len()).map(|at| format!("{RUNS}/{at}")).collect();
+        runs.tables.push(Table { links, ..table(&shown, &input.runs) });
         let curves = curves(&shown, input, measured.measure.as_deref())?;
         Ok(html(&format!("Runs in {}", shown.folder.display()), &[curves, runs]))
     })
@@ -161,14 +201,42 @@ fn curves(shown: &Shown, input: Input, measure: Option<&str>) -> Result<Section,
         _ => None,
     };
     let by = input.keys_by(&shown.by);
-    let evaluated = input.runs.into_iter().filter(|run| !run.evaluations.is_empty()).collect();
-    match groups(evaluated, &Options { measure, by, ..Options::default() }) {
+    let of_run = |run: &Record| {
+        run.evaluations.iter().flat_map(|it| it.tasks.values()).any(|it| it.win_rate.is_some())
+    };
+    let has_wins = input.runs.iter().any(of_run);
+    // What cannot be compared on one task set keeps no other's curves away.
+    let mut sets: BTreeMap<(String, Option<String>), Vec<Record>> = BTreeMap::new();
+    for run in input.runs.into_iter().filter(|run| !run.evaluations.is_empty()) {
+        let task_set = run.task_set().unwrap_or(&run.folder).to_owned();
+        let interval = run.kind.get("evaluation.every_env_steps").cloned();
+        sets.entry((task_set, interval)).or_default().push(run);
+    }
+    for runs in sets.into_values() {
+        let options = Options { measure, by: by.clone(), ..Options::default() };
+        set_curves(&mut section, &runs, options)?;
+    }
+    if has_wins {
+        section.links.push((format!("{RUNS}?measure=return"), "returns".to_owned()));
+        section.links.push((format!("{RUNS}?measure=win_rate"), "win rates".to_owned()));
+    }
+    Ok(section)
+}
+
+/// Curves of the runs of one task set that were evaluated as often.
+fn set_curves(section: &mut Section, runs: &[Record], options: Options) -> Result<(), Wrong> {
+    match apart_by_settings(runs, options) {
         Err(error) => section.text.push(error.to_string()),
-        Ok(groups) => {
+        Ok((groups, keys)) => {
+            if !keys.is_empty() {
+                section
+                    .text
+                    .push(format!("Runs of a method that differ in {} are drawn apart.", keys.join(", ")));
+            }
             let styles = Styles::of(&groups);
             for group in &groups {
                 let methods: Vec<_> = group.methods.iter().collect();
-                let chart = figures::chart(group, &methods, Split::Training, &styles);
+                let chart = figures::chart(group, &methods, Split::Training, Drawn::MeanAndInterval, &styles);
                 section.figures.push(Figure {
                     id: group.id.clone(),
                     title: group.title.clone(),
@@ -178,18 +246,36 @@ fn curves(shown: &Shown, input: Input, measure: Option<&str>) -> Result<Section,
                     svg: chart::curves(&[chart])?,
                 });
             }
-            if groups.iter().any(|group| {
-                group.methods[0].runs[0]
-                    .evaluations
-                    .iter()
-                    .any(|it| it.tasks.values().any(|result| result.win_rate.is_some()))
-            }) {
-                section.links.push((format!("{RUNS}?measure=return"), "returns".to_owned()));
-                section.links.push((format!("{RUNS}?measure=win_rate"), "win rates".to_owned()));
-            }
         }
     }
-    Ok(section)
+    Ok(())
+}
+
+/// Runs that may be averaged, put together; those of one method that differ in settings are methods of their own, and the
+/// keys are returned. Where too many settings differ for a label, it stays an error.
+fn apart_by_settings(
+    runs: &[Record],
+    mut options: Options,
+) -> Result<(Vec<Group>, Vec<String>), ReportError> {
+    /// In what is shown of a label.
+    const KEYS_MAX: usize = 4;
+    let mut keys: Vec<String> = Vec::new();
+    loop {
+        let error = match groups(runs.to_vec(), &options) {
+            Ok(groups) => return Ok((groups, keys)),
+            Err(error) => error,
+        };
+        let ReportError::Kinds(kinds) = &error else { return Err(error) };
+        // Records without settings are told apart by their folders.
+        let folder = kinds.by.iter().find(|key| *key == "folder");
+        let differing = folder.map_or_else(|| kinds.by.clone(), |folder| vec![folder.clone()]);
+        let new: Vec<String> = differing.into_iter().filter(|key| !options.by.contains(key)).collect();
+        if new.is_empty() || keys.len() + new.len() > KEYS_MAX {
+            return Err(error);
+        }
+        keys.extend(new.iter().cloned());
+        options.by.extend(new);
+    }
 }
 
 fn table(shown: &Shown, runs: &[Record]) -> Table {
@@ -197,7 +283,10 @@ fn table(shown: &Shown, runs: &[Record]) -> Table {
         let or_dash = |text: Option<String>| text.unwrap_or_else(|| "–".to_owned());
         let state = run.ended.map_or_else(|| "runs, or was killed".to_owned(), |ended| ended.to_string());
         let last = run.evaluations.iter().rfind(|it| it.split == Split::Training);
-        let last = last.map(|evaluation| rit_record::in_words(evaluation.tasks.values()));
+        let last = last.and_then(|evaluation| {
+            let results: Vec<_> = evaluation.tasks.values().map(rit_learner::messages::task_result).collect();
+            crate::report::in_words(&results)
+        });
         vec![
             shown.name(run),
             or_dash(run.method().map(str::to_owned)),
@@ -208,13 +297,15 @@ fn table(shown: &Shown, runs: &[Record]) -> Table {
             or_dash(last),
         ]
     };
-    let head = ["run", "method", "task set", "seed", "state", "env. steps", "last evaluation"];
+    let head =
+        ["run", "method", "task set", "seed", "state", "env. steps", "last evaluation, mean over tasks"];
     Table {
         id: "all-runs".to_owned(),
         title: String::new(),
         head: head.map(str::to_owned).to_vec(),
         rows: runs.iter().map(row).collect(),
         note: String::new(),
+        ..Table::default()
     }
 }
 
@@ -258,16 +349,26 @@ fn by_task(run: Record) -> Result<Section, Wrong> {
             let alone = Group {
                 training: if split == Split::Training { vec![task.clone()] } else { Vec::new() },
                 testing: if split == Split::Testing { vec![task.clone()] } else { Vec::new() },
-                title: task.clone(),
+                title: format!("{task}{}", if split == Split::Testing { " (unseen)" } else { "" }),
                 ..group.clone()
             };
             let methods: Vec<_> = alone.methods.iter().collect();
-            figures::chart(&alone, &methods, split, &styles)
+            figures::chart(&alone, &methods, split, Drawn::MeanAndInterval, &styles)
         };
         let tasks = group.training.iter().map(|task| (Split::Training, task));
         let tasks = tasks.chain(group.testing.iter().map(|task| (Split::Testing, task)));
-        let charts: Vec<_> =
-            tasks.map(of_task).filter(|chart| chart.lines.iter().any(|it| !it.points.is_empty())).collect();
+        let methods: Vec<_> = group.methods.iter().collect();
+        let mean = |split: Split, title: &str| {
+            let all = Group { title: title.to_owned(), ..group.clone() };
+            (group.tasks(split).len() > 1)
+                .then(|| figures::chart(&all, &methods, split, Drawn::MeanAndInterval, &styles))
+        };
+        let means =
+            mean(Split::Training, "training tasks").into_iter().chain(mean(Split::Testing, "unseen tasks"));
+        let charts: Vec<_> = means
+            .chain(tasks.map(of_task))
+            .filter(|chart| chart.lines.iter().any(|it| !it.points.is_empty()))
+            .collect();
         section.figures.push(Figure {
             id: group.id.clone(),
             title: group.title.clone(),
@@ -302,6 +403,9 @@ async fn episode(
             section.image = Some((address, format!("episode {number} of {task}")));
         } else {
             section.tables.push(steps(&record, &task, number)?);
+        }
+        if let Some(before) = number.checked_sub(1) {
+            section.links.push((format!("{RUNS}/{run}/{task}/{before}"), "episode before".to_owned()));
         }
         section.links.push((format!("{RUNS}/{run}/{task}/{}", number + 1), "next episode".to_owned()));
         section.links.push((format!("{RUNS}/{run}"), "the run".to_owned()));
@@ -339,6 +443,7 @@ fn steps(run: &Record, task: &str, number: u64) -> Result<Table, Wrong> {
         head: ["step".to_owned()].into_iter().chain(agents).chain(["reward".to_owned()]).collect(),
         rows: joints.map(row).collect(),
         note: String::new(),
+        ..Table::default()
     })
 }
 

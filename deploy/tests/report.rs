@@ -96,6 +96,15 @@ fn shapley(folder: &RunFolder, run: &str) {
     assert_eq!(found["estimates"].as_array().unwrap().len(), 4, "M = 1, 2, 4 and all 6 orders");
     roxmltree::Document::parse(&fs::read_to_string(&figure).unwrap()).unwrap();
     refused(&arguments, &["shapley.svg is there already"]);
+    let out = folder.path().join("with-shapley");
+    let place = out.to_str().unwrap();
+    let brief = ["report", run, "--out", place, "--replications", "200", "--without-data"];
+    assert!(output(&brief).status.success());
+    assert_eq!(names(&out), ["index.html", "tables"]);
+    let page = fs::read_to_string(out.join("index.html")).unwrap();
+    assert!(page.contains("navigation-3-3 (the final weights, 2 greedy episodes, 50 steps)"), "{page}");
+    let table = fs::read_to_string(out.join("tables/shapley-estimates.md")).unwrap();
+    assert!(table.contains("| M = 1 | M = 2 | M = 4 | M = 6 |"), "{table}");
     let task = |name| ["shapley", "--run", run, "--task", name];
     refused(&task("navigation-7-7"), &["has 7 agents", "up to 6"]);
     refused(&task("navigation"), &["unknown task"]);

@@ -147,6 +147,7 @@ impl Scored {
                 "{} In brackets: 95 % intervals of the stratified bootstrap, {} replications, seed {}.",
                 self.scale, options.replications, options.seed
             ),
+            ..Table::default()
         };
         let mut charts = names.map(|name| Rows {
             title: name.to_owned(),
@@ -248,6 +249,7 @@ impl Scored {
                 "How probably a run of X scores higher than one of Y on a task picked at random; a draw counts half. In \
                  brackets: 95 % intervals of the stratified bootstrap, {CURVE_REPLICATIONS} replications."
             ),
+            ..Table::default()
         };
         let mut rows = Vec::new();
         for (x, y) in pairs {

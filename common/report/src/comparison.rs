@@ -1,6 +1,7 @@
 //! Which runs belong together: task sets, the methods on each, and the seeds of each method.
 
 use crate::{ReportError, error::OtherKind, measure::Measure, paper};
+use rit_algo::Regime;
 use rit_env::{Split, TaskSet};
 use rit_record::Record;
 use std::collections::{BTreeMap, BTreeSet};
@@ -199,7 +200,7 @@ fn value<'a>(run: &'a Record, key: &str) -> Option<&'a String> {
 /// The method's name, and what sets it apart from others of that name.
 fn label(run: &Record, task_set: &str, by: &[String]) -> String {
     let mut label = run.method().map_or_else(|| older(run, task_set), str::to_owned);
-    if run.settings.get(PERMUTATION).is_some_and(|value| value == "false") {
+    if run.settings.get(PERMUTATION).is_some_and(|value| value == "false") && is_permuted(&label) {
         label += NO_PERMUTATION;
     }
     for key in by {
@@ -215,6 +216,13 @@ fn label(run: &Record, task_set: &str, by: &[String]) -> String {
     }
     // marl-eval takes no comma in a name.
     label.replace(',', ";")
+}
+
+/// Whether a method permutes the decision order unless something else is said: those of actor and critic do not.
+fn is_permuted(method: &str) -> bool {
+    let all = rit_algo::Method::ALL.into_iter().map(rit_algo::Method::facts);
+    let found = all.into_iter().find(|facts| facts.name == method);
+    found.is_none_or(|facts| facts.regime == Regime::Replay)
 }
 
 /// A record without settings is of a build that had RIT alone; what its folder's name adds to the task set's is what was

@@ -88,8 +88,8 @@ pub enum ReportError {
 #[error(
     "{first} and {second} are both {method} on {task_set}, but differ in {}; runs of different configurations are not \
      averaged: leave one out, or give {} to compare them",
-    differences.join(", "),
-    by.iter().map(|key| format!("--by {key}")).collect::<Vec<_>>().join(" ")
+    shortened(differences),
+    remedy(by)
 )]
 pub struct OtherKind {
     /// A run.
@@ -104,6 +104,25 @@ pub struct OtherKind {
     pub differences: Vec<String>,
     /// The keys.
     pub by: Vec<String>,
+}
+
+/// Records without settings differ from others in every key: no more than these are said.
+const SHOWN_MAX: usize = 8;
+
+fn shortened(differences: &[String]) -> String {
+    let shown = differences.iter().take(SHOWN_MAX).map(String::as_str).collect::<Vec<_>>().join(", ");
+    match differences.len().saturating_sub(SHOWN_MAX) {
+        0 => shown,
+        more => format!("{shown} and {more} more"),
+    }
+}
+
+fn remedy(by: &[String]) -> String {
+    match by.iter().find(|key| *key == "folder") {
+        // A record without settings: its folder tells it apart.
+        Some(folder) => format!("--by {folder}"),
+        None => by.iter().map(|key| format!("--by {key}")).collect::<Vec<_>>().join(" "),
+    }
 }
 
 fn seed_words(seed: Option<u64>) -> String {

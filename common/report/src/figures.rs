@@ -8,11 +8,57 @@ use crate::{
     paper::{FIGURES, PaperFigure},
 };
 use rit_env::{Split, TaskSet};
-use rit_statistics::{mean, t_interval};
+use rit_statistics::{Interval, mean, median, standard_deviation, standard_error, t_interval};
 use std::collections::BTreeMap;
 
-const BANDS: &str = "Lines: mean over seeds of the mean over tasks, greedy episodes. Bands: 95 % intervals of Student's t \
-                     over seeds; thin lines: single runs, where there are fewer than 5 seeds.";
+/// What is drawn of several runs: a line and a band.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Drawn {
+    /// The mean and its 95 % interval: all that is no figure of the paper.
+    MeanAndInterval,
+    /// Mean and standard deviation ("we ... plot the mean/std in all figures", section VI-G).
+    MeanAndDeviation,
+    /// Median and standard error (caption of figure 3).
+    MedianAndError,
+}
+
+impl Drawn {
+    fn centre(self, values: &[f64]) -> f64 {
+        match self {
+            Self::MeanAndInterval | Self::MeanAndDeviation => mean(values),
+            Self::MedianAndError => median(values),
+        }
+    }
+
+    /// None of fewer than two values.
+    fn band(self, values: &[f64]) -> Option<Interval> {
+        let about = |reach: Option<f64>| {
+            let (centre, reach) = (self.centre(values), reach?);
+            Some(Interval { low: centre - reach, high: centre + reach })
+        };
+        match self {
+            Self::MeanAndInterval => t_interval(values),
+            Self::MeanAndDeviation => about(standard_deviation(values)),
+            Self::MedianAndError => about(standard_error(values)),
+        }
+    }
+
+    fn caption(self) -> String {
+        let (line, band) = match self {
+            Self::MeanAndInterval => ("mean", "95 % intervals of Student's t over seeds"),
+            Self::MeanAndDeviation => {
+                ("mean", "one standard deviation over seeds to either side, as in the paper")
+            }
+            Self::MedianAndError => {
+                ("median", "one standard error over seeds to either side, as in the paper")
+            }
+        };
+        format!(
+            "Lines: {line} over seeds of the mean over tasks, greedy episodes. Bands: {band}; thin lines: single runs, where \
+             there are fewer than 5 seeds."
+        )
+    }
+}
 
 /// The paper's figures 2 to 5 as far as there are runs for them, then the groups that none of them shows.
 ///
@@ -22,8 +68,10 @@ pub fn learning_curves(groups: &[Group], styles: &Styles) -> Result<Vec<Figure>,
     let mut figures = Vec::new();
     for figure in &FIGURES {
         let shown = shown(figure, groups);
-        let charts: Vec<Chart> =
-            shown.iter().map(|(group, methods)| chart(group, methods, Split::Training, styles)).collect();
+        let charts: Vec<Chart> = shown
+            .iter()
+            .map(|(group, methods)| chart(group, methods, Split::Training, figure.drawn, styles))
+            .collect();
         if charts.is_empty() {
             continue;
         }
@@ -37,7 +85,7 @@ pub fn learning_curves(groups: &[Group], styles: &Styles) -> Result<Vec<Figure>,
         figures.push(Figure {
             id: format!("figure-{}", figure.number),
             title: format!("Figure {} of the paper: {}", figure.number, figure.title),
-            caption: format!("{BANDS}{missing}"),
+            caption: format!("{}{missing}", figure.drawn.caption()),
             svg: chart::curves(&charts)?,
         });
     }
@@ -49,8 +97,8 @@ pub fn learning_curves(groups: &[Group], styles: &Styles) -> Result<Vec<Figure>,
         figures.push(Figure {
             id: format!("curves-{}", group.id),
             title: format!("Learning curves: {}", group.title),
-            caption: BANDS.to_owned(),
-            svg: chart::curves(&[chart(group, &methods, Split::Training, styles)])?,
+            caption: Drawn::MeanAndInterval.caption(),
+            svg: chart::curves(&[chart(group, &methods, Split::Training, Drawn::MeanAndInterval, styles)])?,
         });
     }
     Ok(figures)
@@ -84,7 +132,10 @@ fn shown<'a>(figure: &PaperFigure, groups: &'a [Group]) -> Vec<(&'a Group, Vec<&
 pub fn zero_shot_curves(groups: &[Group], styles: &Styles) -> Result<Option<Figure>, ReportError> {
     let charts: Vec<Chart> = groups
         .iter()
-        .map(|group| chart(group, &group.methods.iter().collect::<Vec<_>>(), Split::Testing, styles))
+        .map(|group| {
+            let methods: Vec<_> = group.methods.iter().collect();
+            chart(group, &methods, Split::Testing, Drawn::MeanAndInterval, styles)
+        })
         .filter(|chart| chart.lines.iter().any(|line| line.points.len() > 1))
         .collect();
     if charts.is_empty() {
@@ -93,7 +144,7 @@ pub fn zero_shot_curves(groups: &[Group], styles: &Styles) -> Result<Option<Figu
     Ok(Some(Figure {
         id: "zero-shot-curves".to_owned(),
         title: "Zero-shot curves: tasks that were never trained on".to_owned(),
-        caption: BANDS.to_owned(),
+        caption: Drawn::MeanAndInterval.caption(),
         svg: chart::curves(&charts)?,
     }))
 }
@@ -142,7 +193,7 @@ fn team_size_chart(group: &Group, styles: &Styles) -> Option<Chart> {
             };
             (*size as f64, method.runs.iter().map(of_run).collect())
         };
-        line(method, &sizes.iter().map(of_size).collect::<Vec<_>>(), styles)
+        line(method, &sizes.iter().map(of_size).collect::<Vec<_>>(), Drawn::MeanAndInterval, styles)
     };
     let seen = |size: &&usize| sizes[size].iter().any(|(split, _)| *split == Split::Training);
     let seen: Vec<String> = sizes.keys().filter(seen).map(ToString::to_string).collect();
@@ -157,11 +208,11 @@ fn team_size_chart(group: &Group, styles: &Styles) -> Option<Chart> {
 }
 
 /// One group's curves, of these methods.
-pub fn chart(group: &Group, methods: &[&Method], split: Split, styles: &Styles) -> Chart {
+pub fn chart(group: &Group, methods: &[&Method], split: Split, drawn: Drawn, styles: &Styles) -> Chart {
     let of_method = |method: &&Method| {
         let curve = group.curve(method, split);
         let points: Vec<_> = curve.into_iter().map(|(step, values)| (step as f64, values)).collect();
-        line(method, &points, styles)
+        line(method, &points, drawn, styles)
     };
     let over = match group.tasks(split).len() {
         1 => String::new(),
@@ -180,10 +231,10 @@ pub fn chart(group: &Group, methods: &[&Method], split: Split, styles: &Styles) 
     }
 }
 
-/// A line of the means of runs, with their interval or the runs themselves.
-pub fn line(method: &Method, points: &[(f64, Vec<f64>)], styles: &Styles) -> Line {
+/// A line of several runs, with its band or, where there are too few for one, the runs themselves.
+pub fn line(method: &Method, points: &[(f64, Vec<f64>)], drawn: Drawn, styles: &Styles) -> Line {
     let reliable = method.is_reliable();
-    let ends = |(x, values): &(f64, Vec<f64>)| t_interval(values).map(|it| (*x, it.low, it.high));
+    let ends = |(x, values): &(f64, Vec<f64>)| drawn.band(values).map(|it| (*x, it.low, it.high));
     let run = |at: usize| points.iter().map(move |(x, values)| (*x, values[at])).collect();
     Line {
         key: styles.key(&method.label),
@@ -192,6 +243,26 @@ pub fn line(method: &Method, points: &[(f64, Vec<f64>)], styles: &Styles) -> Lin
             runs if reliable || runs < 2 => Vec::new(),
             runs => (0..runs).map(run).collect(),
         },
-        points: points.iter().map(|(x, values)| (*x, mean(values))).collect(),
+        points: points.iter().map(|(x, values)| (*x, drawn.centre(values))).collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_and_bands_are_what_the_caption_says() {
+        // Mean 3, deviation √7, error √(7/3); median 2; t(2) for 95 % is 4.3027.
+        let values = [6.0, 1.0, 2.0];
+        let drawn = |drawn: Drawn| {
+            let band = drawn.band(&values).unwrap();
+            [drawn.centre(&values), band.low, band.high].map(|it| (it * 1000.0).round() / 1000.0)
+        };
+        assert_eq!(drawn(Drawn::MeanAndDeviation), [3.0, 0.354, 5.646]);
+        assert_eq!(drawn(Drawn::MedianAndError), [2.0, 0.472, 3.528]);
+        assert_eq!(drawn(Drawn::MeanAndInterval), [3.0, -3.572, 9.572]);
+        assert!(Drawn::MedianAndError.caption().starts_with("Lines: median over seeds"));
+        assert!(Drawn::MeanAndDeviation.band(&[1.0]).is_none());
     }
 }

@@ -15,16 +15,18 @@ mod page;
 mod paper;
 mod results;
 mod setup;
+mod shapley;
 mod table;
 
 pub use comparison::{Group, Method, Options, groups};
 pub use error::ReportError;
 pub use measure::{Measure, signed};
 pub use page::{CSS, Section, page};
+pub use shapley::figure as shapley_figure;
 pub use table::Table;
 
 use rit_env::Split;
-use rit_record::{CellState, Record, Sweep};
+use rit_record::{CellState, Record, RecordError, Sweep};
 use std::{
     collections::BTreeMap,
     path::{Path, PathBuf},
@@ -115,6 +117,17 @@ pub struct SweepState {
 /// # Errors
 /// When a path holds none, or one cannot be read.
 pub fn read(paths: &[PathBuf]) -> Result<Input, ReportError> {
+    read_by(paths, Record::read)
+}
+
+/// The same, each run read by this function.
+///
+/// # Errors
+/// As [`read`].
+pub fn read_by(
+    paths: &[PathBuf],
+    record: impl Fn(&Path) -> Result<Record, RecordError>,
+) -> Result<Input, ReportError> {
     let mut input = Input::default();
     for (at, path) in paths.iter().enumerate() {
         if paths[..at].contains(path) {
@@ -126,7 +139,7 @@ pub fn read(paths: &[PathBuf]) -> Result<Input, ReportError> {
         input.sweeps.extend(Sweep::read(path)?.map(|sweep| state(path, &sweep)));
     }
     for path in rit_record::discover(paths)? {
-        input.runs.push(Record::read(&path)?);
+        input.runs.push(record(&path)?);
     }
     Ok(input)
 }
@@ -210,6 +223,7 @@ pub fn report(
     let mut variation = Section::new("variation", "Variation between runs");
     variation.tables.push(results::variation(groups));
     sections.push(variation);
+    sections.push(shapley::section(groups)?);
     sections.extend(more);
     let mut setup = Section::new("setup", "Everything that is not the algorithm");
     setup.tables = vec![setup::protocol(groups), setup::runs(groups)];

@@ -1,6 +1,6 @@
 //! What the paper has: its task sets, methods, figures, and the numbers of its tables III to V (section VI).
 
-use crate::comparison::NO_PERMUTATION;
+use crate::{comparison::NO_PERMUTATION, figures::Drawn};
 use rit_algo::Method;
 use rit_env::TaskSet;
 
@@ -31,6 +31,8 @@ pub struct PaperFigure {
     pub methods: &'static [&'static str],
     /// Whether its runs learn a single task.
     pub single_task: bool,
+    /// What its lines and bands are.
+    pub drawn: Drawn,
 }
 
 const RIVALS: [&str; 10] =
@@ -47,6 +49,7 @@ pub const FIGURES: [PaperFigure; 4] = [
         task_sets: &["matrix-game", NAVIGATION, "predator-prey", "predator-prey-pro"],
         methods: &[],
         single_task: false,
+        drawn: Drawn::MeanAndDeviation,
     },
     PaperFigure {
         number: 3,
@@ -54,6 +57,7 @@ pub const FIGURES: [PaperFigure; 4] = [
         task_sets: &["3-8m", "3-8sz", "3-8MMM", "3-8csz"],
         methods: &[],
         single_task: false,
+        drawn: Drawn::MedianAndError,
     },
     PaperFigure {
         number: 4,
@@ -61,6 +65,7 @@ pub const FIGURES: [PaperFigure; 4] = [
         task_sets: &[NAVIGATION, "3-8MMM", "3-8csz", "3-8sz"],
         methods: &["rit", NO_ORDER, NO_TASKS, "qmix-attn"],
         single_task: false,
+        drawn: Drawn::MeanAndDeviation,
     },
     PaperFigure {
         number: 5,
@@ -68,6 +73,7 @@ pub const FIGURES: [PaperFigure; 4] = [
         task_sets: &["3-8m", "3-8sz", "3-8MMM", "3-8csz"],
         methods: &["qmix-int", "qmix-int-no-random-permutation", "vdn-int", "vdn-int-no-random-permutation"],
         single_task: true,
+        drawn: Drawn::MeanAndDeviation,
     },
 ];
 

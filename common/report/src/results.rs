@@ -62,8 +62,7 @@ fn beside_ours(table: &PaperTable, groups: &[Group]) -> Option<Table> {
         note: "Mean ± standard error over seeds of the mean over unseen tasks (paper: five seeds); in parentheses our \
                number of seeds. ▲ or ▼: ours is higher or lower by more than both errors together; of a single seed there \
                is no error and no mark."
-            .to_owned(),
-    })
+            .to_owned(), ..Table::default() })
 }
 
 fn our_cell(measure: Measure, scores: &[f64], paper: Option<(f64, f64)>) -> String {
@@ -114,8 +113,7 @@ pub fn by_task(group: &Group) -> Table {
         rows,
         note: "Mean over seeds of greedy episodes at the end of training, with its 95 % interval of Student's t; in \
                parentheses the number of seeds. † fewer than 5 seeds: the interval is not reliable."
-            .to_owned(),
-    }
+            .to_owned(), ..Table::default() }
 }
 
 /// Mean and interval.
@@ -161,8 +159,7 @@ pub fn gaps(groups: &[Group]) -> Option<Table> {
         note: "Mean over seeds with its 95 % interval of Student's t († fewer than 5 seeds: not reliable). Returns of \
                unseen tasks are sums over other numbers of agents, so a gap of returns is to be compared between methods \
                and not with 0; a gap of win rates is what it says."
-            .to_owned(),
-    })
+            .to_owned(), ..Table::default() })
 }
 
 /// How the runs of a method vary.
@@ -197,6 +194,5 @@ pub fn variation(groups: &[Group]) -> Table {
         head: head.chain(["75 % − 25 %".to_owned(), "seeds".to_owned()]).collect(),
         rows: rows.collect(),
         note: "Of each run's mean over tasks at the end of training; between two runs percentiles lie on a straight line."
-            .to_owned(),
-    }
+            .to_owned(), ..Table::default() }
 }

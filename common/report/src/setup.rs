@@ -57,8 +57,7 @@ pub fn runs(groups: &[Group]) -> Table {
         rows: rows.collect(),
         note: "CPU s: processor time of all processes of a run, evaluations included; wall s: how long learners ran. \
                Weights: the beginning of the SHA-256 of the final weights. – : the record does not say."
-            .to_owned(),
-    }
+            .to_owned(), ..Table::default() }
 }
 
 /// What all runs have in common, and what sets methods apart.
@@ -86,6 +85,7 @@ pub fn settings(groups: &[Group]) -> Vec<Table> {
         head: ["key", "value"].map(str::to_owned).to_vec(),
         rows: shared.into_iter().map(|key| vec![key.clone(), all[0].1.settings[key].clone()]).collect(),
         note: String::new(),
+        ..Table::default()
     };
     let row = |key: &String| {
         let mut holders: BTreeMap<String, Vec<&str>> = BTreeMap::new();
@@ -112,6 +112,7 @@ pub fn settings(groups: &[Group]) -> Vec<Table> {
         head: ["key", "value: where"].map(str::to_owned).to_vec(),
         rows: other.into_iter().map(row).collect(),
         note: String::new(),
+        ..Table::default()
     };
     if other.rows.is_empty() { vec![shared] } else { vec![other, shared] }
 }
@@ -163,8 +164,7 @@ pub fn protocol(groups: &[Group]) -> Table {
         rows: groups.iter().map(row).collect(),
         note: "Greedy episodes; a run's result is the evaluation of its final weights. Aggregates over tasks take the best \
                policy over ten times as many episodes (the absolute metric) of runs that have it, the final weights of others."
-            .to_owned(),
-    }
+            .to_owned(), ..Table::default() }
 }
 
 /// A number in groups of three digits.

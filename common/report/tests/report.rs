@@ -195,6 +195,18 @@ fn configurations_are_compared_where_that_is_asked_for() {
 }
 
 #[test]
+fn a_method_is_named_for_a_permutation_that_it_is_without_unless_it_never_has_one() {
+    let folder = tempfile::tempdir().unwrap();
+    for method in ["rit", "mat"] {
+        Run::new(method, 1).with("algorithm.random_permutation", "false").write(folder.path(), method);
+    }
+    let input = read(&[folder.path().to_owned()]).unwrap();
+    let (groups, _) = finished(&input, &options()).unwrap();
+    let labels: Vec<&str> = groups[0].methods.iter().map(|method| method.label.as_str()).collect();
+    assert_eq!(labels, ["rit-no-random-permutation", "mat"]);
+}
+
+#[test]
 fn a_report_has_these_files_and_each_can_be_read() {
     let folder = tempfile::tempdir().unwrap();
     comparison(folder.path());

@@ -20,6 +20,9 @@ The file:
   [[override]]                             # what some cells set beyond that
   where = { \"algorithm.name\" = \"rit\" }
   set = { \"algorithm.lr\" = 0.001 }
+  [[also]]                                 # further cells: every combination of these, once with every seed
+  \"algorithm.name\" = [\"rit\"]
+  \"algorithm.random_permutation\" = [false]
 
 Each run lies in DIR/runs/NAME. Started again, the same command leaves out what is finished and goes on with the rest.
 Exit codes: 0 all cells are finished, 1 some are not, 2 something given was wrong, 130 interrupted.";
@@ -39,7 +42,8 @@ pub struct SweepOptions {
     /// many at once
     #[arg(long, value_name = "N", value_parser = within::<usize>(1, 256))]
     pub jobs: Option<usize>,
-    /// Run nothing: list the runs, how each stands, and what they will take by what finished ones took
+    /// Run nothing: list the runs, how each stands, and what they will take by what finished ones took, and by records that
+    /// lie in the file's folder. Needs no --dir
     #[arg(long)]
     pub dry_run: bool,
     /// Write an array job for Slurm in place of running: each index runs one cell
@@ -48,6 +52,9 @@ pub struct SweepOptions {
     /// Write an Indexed Job for Kubernetes in place of running
     #[arg(long, value_name = "OUT.yaml", conflicts_with_all = ["dry_run", "cell"])]
     pub kubernetes: Option<PathBuf>,
+    /// Try cells again that have diverged, whose runs would end the same way unless the program has changed
+    #[arg(long)]
+    pub retry: bool,
     /// Queue of Kueue that the job waits in
     #[arg(long, value_name = "NAME", requires = "kubernetes", value_parser = label)]
     pub queue: Option<String>,
@@ -141,6 +148,9 @@ pub struct ReportOptions {
     /// Write the report even if something else lies in that folder, beside it
     #[arg(long)]
     pub force: bool,
+    /// Write the page and the tables alone, without runs.csv, marl-eval.json and figures/: what version control may hold
+    #[arg(long)]
+    pub without_data: bool,
     /// What is compared; without it win rates where tasks can be won, returns elsewhere
     #[arg(long, value_enum)]
     pub metric: Option<PlotMetric>,

@@ -8,11 +8,12 @@ use game::StepGame;
 use rand::seq::SliceRandom as _;
 use rit_episode::{Episode, RunSeed, Stream};
 use rit_learner::{checkpoint::Which, evaluation::Evaluator, trainer::evaluation_seed};
+use rit_policy::weights_file;
+use rit_record::{Residual, Shapley, ShapleyEstimate, Symmetry};
 use rit_statistics::{
     correlation, mean,
     shapley::{PLAYERS_MAX, asymmetry, exact, permutations},
 };
-use serde::Serialize;
 use std::process::ExitCode;
 
 /// Most decision orders that utilities are averaged over.
@@ -20,66 +21,6 @@ const ORDERS_MAX: usize = 24;
 /// Two agents count as symmetric at a step if no coalition gains by one of them more than this share of what the whole
 /// team's actions are worth there.
 const SYMMETRIC: f64 = 0.05;
-
-/// What was found.
-#[derive(Debug, Serialize)]
-pub struct Findings {
-    pub run: String,
-    pub task: String,
-    pub method: String,
-    pub agents: usize,
-    pub episodes: usize,
-    pub steps: usize,
-    /// Steps whose continuations were rolled.
-    pub rolled_steps: usize,
-    /// Pearson's correlation over agents and steps: utilities in the episode's own order (M = 1) with the Shapley values
-    /// of the learned game, with those of the environment's own, and these two with each other.
-    pub utilities_learned: Option<f64>,
-    pub utilities_own: Option<f64>,
-    pub learned_own: Option<f64>,
-    /// The same of utilities with all agents' mean at the step taken off both sides: which agent counts for more.
-    pub within_steps_learned: Option<f64>,
-    pub within_steps_own: Option<f64>,
-    /// Equation 10's estimate with M orders: mean absolute difference from the learned game's Shapley values, and the
-    /// correlation with them.
-    pub estimates: Vec<Estimate>,
-    /// Mean absolute Shapley value of the learned game: what errors are to be compared with.
-    pub mean_shapley: f64,
-    /// Lemma 1: mean absolute difference of the sum of Shapley values, of utilities, from what they are said to sum to.
-    pub efficiency: Vec<Residual>,
-    pub symmetry: Symmetry,
-    #[serde(skip)]
-    pub points: Vec<[f64; 2]>,
-    #[serde(skip)]
-    pub own_points: Vec<[f64; 2]>,
-}
-
-/// Of equation 10.
-#[derive(Debug, Serialize)]
-pub struct Estimate {
-    pub orders: usize,
-    pub mean_error: f64,
-    pub correlation: Option<f64>,
-}
-
-/// How far a sum is from something.
-#[derive(Debug, Serialize)]
-pub struct Residual {
-    pub sum: &'static str,
-    pub of: &'static str,
-    pub mean_error: f64,
-    pub mean_size: f64,
-}
-
-/// Pairs of agents that the learned game treats alike.
-#[derive(Debug, Serialize)]
-pub struct Symmetry {
-    pub pairs: usize,
-    /// Mean absolute difference between the two, of Shapley values and of utilities (M = 1, and over all orders).
-    pub shapley: f64,
-    pub utilities: f64,
-    pub averaged: f64,
-}
 
 /// `rit shapley`.
 ///
@@ -120,9 +61,14 @@ pub fn run(options: &ShapleyOptions) -> Result<ExitCode, Failure> {
     found.run = options.run.display().to_string();
     found.task = task.to_string();
     found.method = trained.model.method().facts().name.to_owned();
+    found.weights_digest = weights_file::digest(&trained.params);
     found.episodes = episodes.len();
     if let Some(out) = &options.out {
-        new_file::write(out, said::figure(&found)?.as_bytes(), options.force)?;
+        new_file::write(out, rit_report::shapley_figure(&found)?.as_bytes(), options.force)?;
+    }
+    if let Err(error) = found.keep(&options.run) {
+        // Somebody else's run, say: what was found is printed all the same.
+        let _ = output::say(&format!("not kept for `rit report`: {error}"));
     }
     output::print(&if options.json { said::json(&found)? } else { said::text(&found) })?;
     Ok(ExitCode::SUCCESS)
@@ -145,7 +91,7 @@ fn rolled_steps(steps: usize, count: usize) -> Vec<usize> {
 }
 
 /// What all steps say.
-fn findings(steps: &[StepGame], n: usize) -> Findings {
+fn findings(steps: &[StepGame], n: usize) -> Shapley {
     let shapley: Vec<Vec<f64>> = steps.iter().map(|step| exact(&step.learned, n)).collect();
     let own: Vec<Option<Vec<f64>>> =
         steps.iter().map(|step| (!step.own.is_empty()).then(|| exact(&step.own, n))).collect();
@@ -161,14 +107,10 @@ fn findings(steps: &[StepGame], n: usize) -> Findings {
         let averaged: Vec<Vec<f64>> = steps.iter().map(|step| averaged(step, orders, n)).collect();
         let pairs = pairs(averaged.iter().map(|it| &it[..]).zip(shapley.iter().map(|it| &it[..])));
         let errors: Vec<f64> = pairs.iter().map(|(a, b)| (a - b).abs()).collect();
-        Estimate { orders, mean_error: mean(&errors), correlation: correlation(&pairs) }
+        ShapleyEstimate { orders, mean_error: mean(&errors), correlation: correlation(&pairs) }
     });
-    Findings {
-        run: String::new(),
-        task: String::new(),
-        method: String::new(),
+    Shapley {
         agents: n,
-        episodes: 0,
         steps: steps.len(),
         rolled_steps: own_pairs.len() / n,
         utilities_learned: correlation(&learned_pairs),
@@ -182,6 +124,7 @@ fn findings(steps: &[StepGame], n: usize) -> Findings {
         symmetry: symmetry(steps, &shapley, n),
         points: learned_pairs.iter().map(|&(a, b)| [b, a]).collect(),
         own_points: own_pairs.iter().map(|&(a, b)| [b, a]).collect(),
+        ..Shapley::default()
     }
 }
 
@@ -206,10 +149,11 @@ fn averaged(step: &StepGame, orders: usize, n: usize) -> Vec<f64> {
 }
 
 fn efficiency(steps: &[StepGame], shapley: &[Vec<f64>]) -> Vec<Residual> {
-    let residual = |sum, of, parts: &dyn Fn(usize) -> (f64, f64)| {
+    let residual = |sum: &str, of: &str, parts: &dyn Fn(usize) -> (f64, f64)| {
         let all: Vec<(f64, f64)> = (0..steps.len()).map(parts).collect();
         let errors: Vec<f64> = all.iter().map(|(sum, of)| (sum - of).abs()).collect();
         let sizes: Vec<f64> = all.iter().map(|(_, of)| of.abs()).collect();
+        let (sum, of) = (sum.to_owned(), of.to_owned());
         Residual { sum, of, mean_error: mean(&errors), mean_size: mean(&sizes) }
     };
     let shapley_sum = |at: usize| shapley[at].iter().sum::<f64>();

@@ -1,22 +1,22 @@
 //! What was found, as people and programs read it.
 
-use super::Findings;
 use crate::failure::Failure;
-use rit_report::chart::{self, Key, Scatter};
+use rit_record::Shapley;
 use std::fmt::Write as _;
 
-/// As JSON.
+/// As JSON, without the points of the figure.
 ///
 /// # Errors
 /// When it cannot be written so.
-pub fn json(found: &Findings) -> Result<String, Failure> {
-    serde_json::to_string_pretty(found).map(|text| text + "\n").map_err(Failure::runtime)
+pub fn json(found: &Shapley) -> Result<String, Failure> {
+    let numbers = Shapley { points: Vec::new(), own_points: Vec::new(), ..found.clone() };
+    serde_json::to_string_pretty(&numbers).map(|text| text + "\n").map_err(Failure::runtime)
 }
 
 /// In words.
-pub fn text(found: &Findings) -> String {
+pub fn text(found: &Shapley) -> String {
     let number = |value: Option<f64>| value.map_or_else(|| "–".to_owned(), |value| format!("{value:.3}"));
-    let Findings { run, task, method, agents, episodes, steps, rolled_steps, .. } = found;
+    let Shapley { run, task, method, agents, episodes, steps, rolled_steps, .. } = found;
     let mut text = format!(
         "{run}: {method} on {task}, {agents} agents, {episodes} greedy episodes, {steps} steps; continuations rolled from \
          {rolled_steps}\n\ncorrelation                                        all   within a step\n"
@@ -45,7 +45,7 @@ pub fn text(found: &Findings) -> String {
     }
     text += "\nsum of              against                             mean error    mean size\n";
     for residual in &found.efficiency {
-        let (sum, of) = (residual.sum, residual.of);
+        let (sum, of) = (&residual.sum, &residual.of);
         let _ =
             writeln!(text, "{sum:18}  {of:33}  {:11.4}  {:11.4}", residual.mean_error, residual.mean_size);
     }
@@ -56,33 +56,4 @@ pub fn text(found: &Findings) -> String {
         symmetry.pairs, symmetry.shapley, symmetry.utilities, symmetry.averaged
     );
     text
-}
-
-/// Utilities against Shapley values, and the error against M.
-///
-/// # Errors
-/// When it cannot be drawn.
-pub fn figure(found: &Findings) -> Result<String, Failure> {
-    let key = |label: &str, style| Key { label: label.to_owned(), style };
-    let scatter = |title: &str, places: &[[f64; 2]], style| Scatter {
-        title: title.to_owned(),
-        x: "Shapley value".to_owned(),
-        y: "utility (M = 1)".to_owned(),
-        key: key(title, style),
-        places: places.to_vec(),
-    };
-    let scatters = [
-        scatter("learned game", &found.points, 0),
-        scatter("the environment's own game", &found.own_points, 3),
-    ];
-    let points = found.estimates.iter().map(|it| (it.orders as f64, it.mean_error)).collect();
-    let error = chart::Chart {
-        title: "Equation 10 with M orders".to_owned(),
-        x: "M".to_owned(),
-        y: "mean |estimate − Shapley value|".to_owned(),
-        y_shown: vec![0.0],
-        lines: vec![chart::Line { key: key(&found.method, 13), points, band: Vec::new(), runs: Vec::new() }],
-        ..chart::Chart::default()
-    };
-    Ok(chart::scatters(&scatters, &[error])?)
 }
