@@ -202,6 +202,41 @@ fn an_interrupted_sweep_goes_on_to_the_same_weights() {
     assert_eq!(sweep.summary("vdn-attn_seed-1")["weights_digest"], alone);
 }
 
+/// ROMA with the largest learning rate there is diverges in its second update (`divergence.rs`).
+#[test]
+fn a_cell_that_has_diverged_is_not_tried_again_unless_somebody_asks() {
+    let text = "experiment = \"matrix-game\"\nseeds = [3]\n[set]\n\"algorithm.name\" = \"roma\"\n\"algorithm.lr\" = 1.0\n\
+                \"training.t_max\" = 2000\n\"evaluation.episodes\" = 1\n\"checkpoints.every_env_steps\" = 8\n";
+    let sweep = Sweep::new(text);
+    let (code, done, stderr) = sweep.run(&[]);
+    assert_eq!((code, &done["counts"]["diverged"]), (Some(1), &1.into()), "{stderr}");
+    let written = || fs::metadata(sweep.dir().join("runs/seed-3/summary.json")).unwrap().modified().unwrap();
+    let before = written();
+    let (code, _, stderr) = sweep.run(&[]);
+    assert!(
+        code == Some(1) && stderr.contains("seed-3: left alone") && stderr.contains("--retry"),
+        "{stderr}"
+    );
+    let (code, _, stderr) = sweep.run(&["--cell", "0"]);
+    assert!(code == Some(1) && stderr.contains("--retry tries again"), "{stderr}");
+    assert_eq!(before, written(), "nothing was run");
+    let (code, _, stderr) = sweep.run(&["--retry"]);
+    assert!(code == Some(1) && before < written(), "{stderr}");
+}
+
+/// On a file system that several hosts share.
+#[test]
+fn a_cell_that_another_host_trained_last_is_unknown() {
+    let sweep = Sweep::new(&SWEEP.replace("[1, 2]", "[1]"));
+    assert_eq!(sweep.run(&["--jobs", "1"]).0, Some(0));
+    let run_dir = sweep.dir().join("runs/rit_seed-1");
+    fs::remove_file(run_dir.join("summary.json")).unwrap();
+    fs::write(run_dir.join("lock"), "1 elsewhere\n").unwrap();
+    let cell = &sweep.status()["cells"][0];
+    assert_eq!(cell["state"], "unknown");
+    assert_eq!(cell["reason"], "it is, or was killed, on another host, elsewhere");
+}
+
 #[test]
 fn what_is_wrong_is_said_and_nothing_is_made() {
     let sweep = Sweep::new(SWEEP);
@@ -269,19 +304,30 @@ fn a_job_of_an_array_runs_its_cell_and_goes_on_with_it() {
 
 #[test]
 fn a_cluster_of_containers_is_told_the_whole_sweep() {
-    let sweep = Sweep::new(SWEEP);
+    let text = SWEEP.replace("\"matrix-game\"", "\"own/small game.toml\"");
+    let sweep = Sweep::new(&text);
+    let own = sweep.folder.path().join("own/small game.toml");
+    fs::create_dir(own.parent().unwrap()).unwrap();
+    fs::write(&own, "environment.task_set = \"matrix-game\"\n").unwrap();
     let out = sweep.folder.path().join("job.yaml");
     let written = sweep.command(&["--kubernetes", out.to_str().unwrap(), "--queue", "lab"]).output().unwrap();
     assert!(written.status.success(), "{}", String::from_utf8_lossy(&written.stderr));
-    let text = fs::read_to_string(&out).unwrap();
-    let (_, data) = text.split_once("  sweep.toml: |\n").unwrap();
-    let (data, _) = data.split_once("---\n").unwrap();
+    let job = fs::read_to_string(&out).unwrap();
+    let (_, data) = job.split_once("  sweep.toml: |\n").unwrap();
+    let (data, _) = data.split_once("  experiment-0.toml: |\n").unwrap();
     let found: String =
         data.lines().map(|line| line.strip_prefix("    ").unwrap_or(line).to_owned() + "\n").collect();
-    assert_eq!(found, SWEEP);
-    for part in
-        ["name: rit-two-methods\n", "completions: 4\n", "suspend: true\n", "kueue.x-k8s.io/queue-name: lab\n"]
-    {
-        assert!(text.contains(part), "{part} in {text}");
+    assert_eq!(found, text);
+    let own = "  experiment-0.toml: |\n    environment.task_set = \"matrix-game\"\n---\n";
+    let item = "- { key: experiment-0.toml, path: \"own/small game.toml\" }\n";
+    for part in [
+        own,
+        item,
+        "name: rit-two-methods\n",
+        "completions: 4\n",
+        "suspend: true\n",
+        "kueue.x-k8s.io/queue-name: lab\n",
+    ] {
+        assert!(job.contains(part), "{part} in {job}");
     }
 }

@@ -19,6 +19,8 @@ pub struct Job {
     queue: Option<String>,
     /// Experiments that are files and no part of the program.
     experiments: Vec<PathBuf>,
+    /// The sweep file's folder, as the experiments' paths begin with it.
+    folder: PathBuf,
 }
 
 impl Job {
@@ -48,6 +50,7 @@ impl Job {
             at_once,
             queue: queue.map(str::to_owned),
             experiments,
+            folder: std::path::absolute(file.parent().unwrap_or(Path::new(""))).unwrap_or_default(),
         })
     }
 
@@ -116,23 +119,43 @@ exit "$status"
     )
 }
 
-/// An Indexed Job for Kubernetes, with the sweep's file in a ConfigMap.
+/// A text as a value of a ConfigMap, under its key.
+fn value(key: &str, path: &Path) -> Result<String, Failure> {
+    let text =
+        read_text(path).map_err(|error| Failure::input_message(format!("{}: {error}", path.display())))?;
+    let line = |line: &str| if line.is_empty() { "\n".to_owned() } else { format!("    {line}\n") };
+    Ok(format!("  {key}: |\n{}", text.lines().map(line).collect::<String>()))
+}
+
+/// Experiments that are files: their values in the ConfigMap, and where each comes to lie beside the sweep's file.
+fn experiment_files(job: &Job) -> Result<(String, String), Failure> {
+    let (mut values, mut places) = (String::new(), String::new());
+    for (at, path) in job.experiments.iter().enumerate() {
+        let inside = path
+            .strip_prefix(&job.folder)
+            .ok()
+            .filter(|inside| inside.components().all(|part| matches!(part, std::path::Component::Normal(_))));
+        let Some(inside) = inside.and_then(Path::to_str) else {
+            return Err(Failure::input_message(format!(
+                "{}: a pod gets the experiments that come with the program, and files in the folder of the sweep's file or \
+                 below it; put this one there",
+                path.display()
+            )));
+        };
+        let key = format!("experiment-{at}.toml");
+        values += &value(&key, path)?;
+        places += &format!("\n              - {{ key: {key}, path: {inside:?} }}");
+    }
+    Ok((values, places))
+}
+
+/// An Indexed Job for Kubernetes, with the sweep's file, and experiments that are files, in a ConfigMap.
 ///
 /// # Errors
-/// When the sweep's file cannot be read any more, or names experiments that are files.
+/// When the sweep's file cannot be read any more, or names experiments that lie elsewhere.
 pub fn kubernetes(job: &Job) -> Result<String, Failure> {
-    if let Some(path) = job.experiments.first() {
-        return Err(Failure::input_message(format!(
-            "{}: a pod has the experiments that come with the program; put what this one sets under [set]",
-            path.display()
-        )));
-    }
-    let text = read_text(&job.file)
-        .map_err(|error| Failure::input_message(format!("{}: {error}", job.file.display())))?;
-    let indented: String = text
-        .lines()
-        .map(|line| if line.is_empty() { "\n".to_owned() } else { format!("    {line}\n") })
-        .collect();
+    let text = value("sweep.toml", &job.file)?;
+    let (experiments, places) = experiment_files(job)?;
     let (name, cells) = (job.name(), job.cells);
     let at_once = job.at_once.unwrap_or(cells);
     let (queue, suspend) = match &job.queue {
@@ -150,8 +173,7 @@ metadata:
   name: rit-{name}
   labels: {{ app.kubernetes.io/name: rit }}
 data:
-  sweep.toml: |
-{indented}---
+{text}{experiments}---
 apiVersion: v1
 kind: PersistentVolumeClaim
 metadata:
@@ -224,7 +246,10 @@ spec:
         - name: runs
           persistentVolumeClaim: {{ claimName: rit-{name} }}
         - name: sweep
-          configMap: {{ name: rit-{name} }}
+          configMap:
+            name: rit-{name}
+            items:
+              - {{ key: sweep.toml, path: sweep.toml }}{places}
         # How much: deploy/docker/Dockerfile. A container's own /dev/shm has 64 MiB.
         - name: shared-memory
           emptyDir: {{ medium: Memory, sizeLimit: 64Mi }}

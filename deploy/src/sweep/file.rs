@@ -22,14 +22,17 @@ pub struct SweepFile {
     /// The experiment that all cells begin from, unless there is an axis of experiments.
     pub experiment: Option<String>,
     pub seeds: Vec<u64>,
-    /// Keys with their values, in the order of the keys' names.
-    pub axes: Vec<(String, Vec<Value>)>,
+    /// Every combination of the values of one of these is a cell: `[axes]`, then each `[[also]]`.
+    pub grids: Vec<Axes>,
     /// What every cell sets.
     pub set: Settings,
     /// Cells of these values are left out.
     pub exclude: Vec<Settings>,
     pub overrides: Vec<Override>,
 }
+
+/// Keys with their values, in the order of the keys' names.
+pub type Axes = Vec<(String, Vec<Value>)>;
 
 /// Values by key, such as `algorithm.name`.
 pub type Settings = BTreeMap<String, Value>;
@@ -52,6 +55,8 @@ struct Typed {
     seeds: Vec<i64>,
     #[serde(default)]
     axes: Table,
+    #[serde(default)]
+    also: Vec<Table>,
     #[serde(default)]
     set: Table,
     #[serde(default)]
@@ -82,15 +87,18 @@ impl SweepFile {
 
     fn parse(text: &str, folder: &Path) -> Result<Self, String> {
         let typed: Typed = toml::from_str(text).map_err(|error| wrong_toml(text, &error))?;
-        let mut axes = Vec::new();
-        for (key, values) in flat(typed.axes) {
-            axes.push((key.clone(), axis(&key, values)?));
+        let mut grids = Vec::new();
+        // Without axes there is one cell, unless there are others.
+        let first = (!typed.axes.is_empty() || typed.also.is_empty()).then_some(typed.axes);
+        for table in first.into_iter().chain(typed.also) {
+            let axes = flat(table).into_iter().map(|(key, values)| Ok((key.clone(), axis(&key, values)?)));
+            grids.push(axes.collect::<Result<Axes, String>>()?);
         }
         let file = Self {
             folder: folder.to_owned(),
             experiment: typed.experiment,
             seeds: seeds(&typed.seeds)?,
-            axes,
+            grids,
             set: flat(typed.set),
             exclude: typed.exclude.into_iter().map(flat).collect(),
             overrides: typed
@@ -103,20 +111,33 @@ impl SweepFile {
         Ok(file)
     }
 
+    fn axes(&self) -> impl Iterator<Item = &(String, Vec<Value>)> {
+        self.grids.iter().flatten()
+    }
+
+    /// The keys that cells differ in, each once.
+    pub fn keys(&self) -> Vec<String> {
+        let mut keys: Vec<String> = self.axes().map(|(key, _)| key.clone()).collect();
+        keys.sort();
+        keys.dedup();
+        keys
+    }
+
     /// Whether its parts go together.
     fn check(&self) -> Result<(), String> {
-        let has_axis = |key: &str| self.axes.iter().any(|(axis, _)| axis == key);
-        match (&self.experiment, has_axis(EXPERIMENT)) {
-            (None, false) => {
-                return Err("it names no experiment; write experiment = \"matrix-game\" (`rit experiments` lists them)".into());
-            }
-            (Some(_), true) => {
-                return Err("it has an experiment and an axis of experiments; one will do".into());
-            }
-            _ => {}
+        let has_axis = |key: &str| self.axes().any(|(axis, _)| axis == key);
+        let names_one = |axes: &Axes| axes.iter().any(|(key, _)| key == EXPERIMENT);
+        if self.experiment.is_none() && !self.grids.iter().all(names_one) {
+            return Err(
+                "it names no experiment; write experiment = \"matrix-game\" (`rit experiments` lists them)"
+                    .into(),
+            );
+        }
+        if self.experiment.is_some() && has_axis(EXPERIMENT) {
+            return Err("it has an experiment and an axis of experiments; one will do".into());
         }
         let sets = std::iter::once(&self.set).chain(self.overrides.iter().map(|it| &it.set));
-        for key in sets.flat_map(BTreeMap::keys).chain(self.axes.iter().map(|(key, _)| key)) {
+        for key in sets.flat_map(BTreeMap::keys).chain(self.axes().map(|(key, _)| key)) {
             if key == SEED {
                 return Err("seeds are given by seeds = [1, 2, 3]: each is run once".into());
             }
@@ -141,15 +162,15 @@ impl SweepFile {
 
     /// A choice of cells must be able to choose some: a mistyped one would pass unseen.
     fn check_choice(&self, key: &str, value: &Value) -> Result<(), String> {
-        let known: Vec<Value> = match self.axes.iter().find(|(axis, _)| axis == key) {
-            Some((_, values)) => values.clone(),
-            None if key == SEED => self.seeds.iter().map(|&seed| Value::Integer(seed as i64)).collect(),
-            None => {
-                let axes = self.axes.iter().map(|(key, _)| key.as_str()).chain([SEED]);
-                let axes = axes.collect::<Vec<_>>().join(", ");
-                return Err(format!("cells are chosen by {key}, which is no axis; the axes are {axes}"));
-            }
-        };
+        let of_axes = self.axes().filter(|(axis, _)| axis == key).flat_map(|(_, values)| values.clone());
+        let mut known: Vec<Value> = of_axes.collect();
+        if known.is_empty() && key == SEED {
+            known.extend(self.seeds.iter().map(|&seed| Value::Integer(seed as i64)));
+        }
+        if known.is_empty() {
+            let axes = self.keys().into_iter().chain([SEED.to_owned()]).collect::<Vec<_>>().join(", ");
+            return Err(format!("cells are chosen by {key}, which is no axis; the axes are {axes}"));
+        }
         if known.contains(value) {
             return Ok(());
         }
@@ -240,7 +261,7 @@ mod tests {
     #[test]
     fn keys_may_be_written_either_way() {
         let file = parse(WHOLE).unwrap();
-        let axes: Vec<_> = file.axes.iter().map(|(key, values)| (key.as_str(), values.len())).collect();
+        let axes: Vec<_> = file.grids[0].iter().map(|(key, values)| (key.as_str(), values.len())).collect();
         assert_eq!(axes, [("algorithm.gamma", 2), ("algorithm.name", 2)]);
         assert_eq!(file.set.keys().collect::<Vec<_>>(), ["learner.tls.key", "training.t_max"]);
         assert_eq!((file.exclude[0].len(), file.overrides[0].set.len()), (2, 1));

@@ -1,6 +1,7 @@
 //! `rit sweep`: the runs of a comparison, side by side on this machine, or as jobs of a cluster.
 
 mod cluster;
+mod costs;
 mod file;
 mod log;
 mod plan;
@@ -16,10 +17,10 @@ use crate::{
 };
 use file::SweepFile;
 use plan::Plan;
-use rit_record::{CellState, Sweep};
+use rit_record::{CellState, Record, Sweep};
 use run::Share;
 use serde_json::json;
-use standing::State;
+use standing::{Standing, State};
 use std::{
     fs::{self, DirBuilder, File, TryLockError},
     os::unix::fs::DirBuilderExt as _,
@@ -39,12 +40,12 @@ pub async fn run(options: SweepOptions, logs: LogOptions) -> Result<ExitCode, Fa
     }
     let missing = |what: &str| Failure::input_message(format!("give {what}; `rit sweep --help` shows how"));
     let path = options.file.as_ref().ok_or_else(|| missing("a sweep's file"))?;
-    let dir = options.dir.as_ref().ok_or_else(|| missing("--dir DIR, where the runs shall lie"))?;
-    let plan = Plan::new(&SweepFile::read(path)?)?;
+    let file = SweepFile::read(path)?;
+    let plan = Plan::new(&file)?;
     if options.dry_run {
-        check(dir, &plan.sweep)?;
-        return shown(dir, &plan, options.json);
+        return dry_run(options.dir.as_deref(), &file.folder, &plan, options.json);
     }
+    let dir = options.dir.as_ref().ok_or_else(|| missing("--dir DIR, where the runs shall lie"))?;
     let cluster = [&options.slurm, &options.kubernetes].into_iter().flatten().next();
     cluster.map_or(Ok(()), |out| new_file::check(out, options.force))?;
     prepare(dir, &plan.sweep)?;
@@ -57,9 +58,28 @@ pub async fn run(options: SweepOptions, logs: LogOptions) -> Result<ExitCode, Fa
         return write(out, &cluster::kubernetes(&job()?)?, options.force);
     }
     if let Some(index) = options.cell {
-        return one(&dir, &plan, index, options.json, logs).await;
+        return one(&dir, &plan, index, &options, logs).await;
     }
     all(&dir, &plan, &options).await
+}
+
+/// Lists the cells, and what they will take by the finished ones and by the records that lie beside the sweep's file.
+fn dry_run(dir: Option<&Path>, folder: &Path, plan: &Plan, json: bool) -> Result<ExitCode, Failure> {
+    let mut standings = match dir {
+        Some(dir) => {
+            check(dir, &plan.sweep)?;
+            standing::of_all(dir, plan)
+        }
+        None => {
+            let cells = plan.sweep.cells.iter().zip(&plan.configs);
+            cells.map(|(cell, config)| Standing::waiting(cell, config)).collect()
+        }
+    };
+    // A folder without records is as good.
+    let found = rit_record::discover(&[folder.to_owned()]).unwrap_or_default();
+    let records: Vec<Record> = found.iter().filter_map(|path| Record::read(path).ok()).collect();
+    standing::estimate(plan, &records, &mut standings);
+    print(&standings, json)
 }
 
 /// Runs one cell in this process, which ends as its run ends: what each job of an array does.
@@ -67,19 +87,26 @@ async fn one(
     dir: &Path,
     plan: &Plan,
     index: usize,
-    json: bool,
+    options: &SweepOptions,
     logs: LogOptions,
 ) -> Result<ExitCode, Failure> {
     let count = plan.sweep.cells.len();
     let cell = plan.sweep.cells.get(index).ok_or_else(|| {
         Failure::input_message(format!("--cell {index}: the sweep's cells are 0 to {}", count - 1))
     })?;
-    if standing::of_cell(dir, cell, &plan.configs[index]).state == State::Finished {
-        output::say(&format!("{}: finished already", cell.name)).map_err(Failure::runtime)?;
-        return Ok(ExitCode::SUCCESS);
+    match standing::of_cell(dir, cell, &plan.configs[index]) {
+        Standing { state: State::Finished, .. } => {
+            output::say(&format!("{}: finished already", cell.name)).map_err(Failure::runtime)?;
+            return Ok(ExitCode::SUCCESS);
+        }
+        Standing { state: State::Diverged, reason, .. } if !options.retry => {
+            let (name, why) = (&cell.name, reason.unwrap_or_default());
+            return Err(Failure::runtime_message(format!("{name}: {why}; --retry tries again")));
+        }
+        _ => {}
     }
     let arguments = run::train_arguments(dir, cell, Share::of_this_machine(Some(1)));
-    let options = crate::cli::train(&arguments, json).map_err(Failure::runtime)?;
+    let options = crate::cli::train(&arguments, options.json).map_err(Failure::runtime)?;
     let ended = crate::train::run(options, logs).await;
     if let Err(failure) = &ended {
         // Whatever becomes of the line, the exit code says it.
@@ -103,9 +130,8 @@ async fn all(dir: &Path, plan: &Plan, options: &SweepOptions) -> Result<ExitCode
         Err(TryLockError::Error(_)) | Ok(()) => {}
     }
     let share = Share::of_this_machine(options.jobs);
-    let outcome = run::run_all(dir, &plan.sweep, &plan.configs, share, options.json).await?;
-    let standings = standing::of_all(dir, &plan.sweep, &plan.configs);
-    output::print(&if options.json { in_json(&standings)? } else { standing::table(&standings) })?;
+    let outcome = run::run_all(dir, plan, share, options.retry, options.json).await?;
+    print(&standing::of_all(dir, plan), options.json)?;
     for (cell, why) in outcome.failed.iter().chain(&outcome.left) {
         let _ = output::say(&format!("{cell}: {}", crate::report::printable(why)));
     }
@@ -126,7 +152,7 @@ fn open(dir: &Path) -> Result<Sweep, Failure> {
 fn status(dir: &Path, json: bool) -> Result<ExitCode, Failure> {
     let sweep = open(dir)?;
     let configs = sweep.cells.iter().map(plan::resolve).collect::<Result<_, _>>()?;
-    shown(dir, &Plan { sweep, configs }, json)
+    print(&standing::of_all(dir, &Plan { sweep, configs }), json)
 }
 
 /// `rit sweep collect`.
@@ -151,13 +177,12 @@ fn collect(dir: &Path, out: &Path) -> Result<ExitCode, Failure> {
     Ok(ExitCode::SUCCESS)
 }
 
-fn shown(dir: &Path, plan: &Plan, json: bool) -> Result<ExitCode, Failure> {
-    let standings = standing::of_all(dir, &plan.sweep, &plan.configs);
-    output::print(&if json { in_json(&standings)? } else { standing::table(&standings) })?;
+fn print(standings: &[Standing], json: bool) -> Result<ExitCode, Failure> {
+    output::print(&if json { in_json(standings)? } else { standing::table(standings) })?;
     Ok(ExitCode::SUCCESS)
 }
 
-fn in_json(standings: &[standing::Standing]) -> Result<String, Failure> {
+fn in_json(standings: &[Standing]) -> Result<String, Failure> {
     let count = |state| standings.iter().filter(|standing| standing.state == state).count();
     let counts: serde_json::Map<_, _> =
         State::ALL.iter().map(|&state| (state.word().replace(' ', "_"), count(state).into())).collect();

@@ -27,7 +27,7 @@ impl Plan {
         let (mut cells, mut configs) = (Vec::new(), Vec::new());
         // Seed by seed: whatever has been run when somebody looks, methods have as many runs.
         for &seed in &file.seeds {
-            for values in combinations(&file.axes) {
+            for values in file.grids.iter().flat_map(|axes| combinations(axes)) {
                 let Some(cell) = cell(file, &values, seed) else { continue };
                 configs.push(resolve(&cell)?);
                 cells.push(cell);
@@ -38,8 +38,7 @@ impl Plan {
         }
         refuse_same(&cells, &configs)?;
         name_apart(&mut cells);
-        let axes = file.axes.iter().map(|(key, _)| key.clone()).collect();
-        Ok(Self { sweep: Sweep::new(axes, cells), configs })
+        Ok(Self { sweep: Sweep::new(file.keys(), cells), configs })
     }
 }
 
@@ -103,7 +102,8 @@ fn found(experiment: &str, folder: &Path) -> String {
     let path = Path::new(experiment);
     if path.extension().is_some_and(|extension| extension == "toml") {
         let path = folder.join(path);
-        return path.canonicalize().unwrap_or(path).display().to_string();
+        // As it is typed: a file of a ConfigMap is a link, which leads elsewhere tomorrow.
+        return std::path::absolute(&path).unwrap_or(path).display().to_string();
     }
     experiment.to_owned()
 }
@@ -154,6 +154,7 @@ fn refuse_same(cells: &[Cell], configs: &[Config]) -> Result<(), Failure> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use rit_algo::Regime;
 
     fn plan(text: &str) -> Result<Plan, String> {
         let folder = tempfile::tempdir().unwrap();
@@ -200,6 +201,84 @@ mod tests {
         let plan = plan("seeds = [1]\n[axes]\nexperiment = ['matrix-game', 'predator-prey']").unwrap();
         assert_eq!(names(&plan), ["matrix-game_seed-1", "predator-prey_seed-1"]);
         assert_eq!((plan.configs[0].algorithm.gamma, plan.configs[1].algorithm.gamma), (0.99, 0.8));
+    }
+
+    #[test]
+    fn other_combinations_may_be_run_beside_those_of_the_axes() {
+        let plan = plan(
+            "seeds = [1]\n[axes]\nexperiment = ['3-8m', 'matrix-game']\n'algorithm.name' = ['rit', 'mat']\n[[also]]\n\
+             experiment = ['3-8m']\n'algorithm.random_permutation' = [false]\n[[override]]\nwhere = { \
+             'algorithm.random_permutation' = false }\nset = { 'algorithm.lr' = 0.25 }",
+        )
+        .unwrap();
+        assert_eq!(
+            names(&plan),
+            [
+                "rit_3-8m_seed-1",
+                "rit_matrix-game_seed-1",
+                "mat_3-8m_seed-1",
+                "mat_matrix-game_seed-1",
+                "random-permutation-false_3-8m_seed-1",
+            ]
+        );
+        let last = &plan.configs[4].algorithm;
+        assert_eq!((last.name.to_string(), last.random_permutation, last.lr), ("rit".into(), false, 0.25));
+        assert_eq!(plan.sweep.axes, ["algorithm.name", "algorithm.random_permutation", "experiment"]);
+    }
+
+    /// Table II for every cell; figures 2 to 5 and tables III to V are made of these.
+    #[test]
+    fn the_papers_comparison_is_whole() {
+        let path = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/results/paper.toml"));
+        let plan = SweepFile::read(path).and_then(|file| Plan::new(&file)).unwrap();
+        let of_cell = |config: &Config| {
+            let (algorithm, environment) = (&config.algorithm, &config.environment);
+            let single = environment.training_tasks.len() == 1;
+            let without = !algorithm.random_permutation && algorithm.name.facts().regime == Regime::Replay;
+            let order = if without { "-no-random-permutation" } else { "" };
+            (format!("{}{order}", algorithm.name), environment.task_set.to_string(), single)
+        };
+        let mut counts: BTreeMap<_, usize> = BTreeMap::new();
+        for config in &plan.configs {
+            *counts.entry(of_cell(config)).or_default() += 1;
+            assert_eq!((config.algorithm.gamma, config.environment.approach_shaping), (0.99, 0.0));
+        }
+        let count = |method: &str, task_set: &str, single| {
+            counts.get(&(method.to_owned(), task_set.to_owned(), single)).copied().unwrap_or(0)
+        };
+        let sets = ["matrix-game", "predator-prey", "predator-prey-pro", "3-8m"];
+        let ablated = ["cooperative-navigation", "3-8sz", "3-8MMM", "3-8csz"];
+        for task_set in sets.into_iter().chain(ablated) {
+            for method in [
+                "rit",
+                "rit-vdn",
+                "refil",
+                "updet-mix",
+                "updet-vdn",
+                "qmix-attn",
+                "vdn-attn",
+                "roma",
+                "mappo",
+                "mat",
+            ] {
+                assert_eq!(count(method, task_set, false), 5, "{method} {task_set}");
+            }
+        }
+        for task_set in ablated {
+            for method in ["rit-no-random-permutation", "rit-no-task-representations"] {
+                assert_eq!(count(method, task_set, false), 5, "{method} {task_set}");
+            }
+        }
+        // Two maps of each set, five seeds.
+        for task_set in ["3-8m", "3-8sz", "3-8MMM", "3-8csz"] {
+            for method in ["qmix-int", "vdn-int"]
+                .iter()
+                .flat_map(|it| [it.to_string(), format!("{it}-no-random-permutation")])
+            {
+                assert_eq!(count(&method, task_set, true), 10, "{method} {task_set}");
+            }
+        }
+        assert_eq!(plan.configs.len(), 600);
     }
 
     #[test]

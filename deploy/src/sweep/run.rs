@@ -1,12 +1,13 @@
 //! Runs the cells of a sweep on this machine, several side by side.
 
 use super::{
-    log, plan,
+    log,
+    plan::{self, Plan},
     screen::Screen,
     standing::{self, Standing, State},
 };
 use crate::{child, control, failure::Failure, report, shutdown};
-use rit_config::{Config, RunDir};
+use rit_config::RunDir;
 use rit_proto::v1::StatusRequest;
 use rit_record::{Cell, CellState, Ended, Sweep};
 use rustix::process::{Pid, Signal, kill_process};
@@ -101,23 +102,33 @@ fn remove_beginning(root: &Path) {
 /// When no process can be started at all.
 pub async fn run_all(
     dir: &Path,
-    sweep: &Sweep,
-    configs: &[Config],
+    plan: &Plan,
     share: Share,
+    retry: bool,
     quiet: bool,
 ) -> Result<Outcome, Failure> {
-    let standings = standing::of_all(dir, sweep, configs);
-    let open = (0..standings.len()).filter(|&at| standings[at].state != State::Finished);
+    let standings = standing::of_all(dir, plan);
+    let is_open = |at: &usize| match standings[*at].state {
+        State::Finished => false,
+        State::Diverged => retry,
+        _ => true,
+    };
+    let open: VecDeque<usize> = (0..standings.len()).filter(is_open).collect();
+    let diverged = standings.iter().filter(|it| !retry && it.state == State::Diverged);
+    let diverged = diverged.map(|it| {
+        let why = it.reason.clone().unwrap_or_default();
+        (it.cell.clone(), format!("left alone, since it would end the same way (--retry tries again): {why}"))
+    });
+    let outcome = Outcome { failed: diverged.collect(), ..Outcome::default() };
     let mut jobs = Jobs {
         dir,
-        sweep,
-        configs,
+        plan,
         share,
-        waiting: open.collect(),
+        waiting: open,
         standings,
         children: JoinSet::new(),
         running: BTreeMap::new(),
-        outcome: Outcome::default(),
+        outcome,
         screen: Screen::new(quiet),
     };
     jobs.screen.say(&standing::in_words(&jobs.standings));
@@ -146,8 +157,7 @@ pub async fn run_all(
 /// The cells that run, and those that wait for their turn.
 struct Jobs<'a> {
     dir: &'a Path,
-    sweep: &'a Sweep,
-    configs: &'a [Config],
+    plan: &'a Plan,
     share: Share,
     /// Cells, by their place in the sweep; here and below.
     waiting: VecDeque<usize>,
@@ -165,7 +175,7 @@ impl Jobs<'_> {
     fn start_next(&mut self) -> Result<(), Failure> {
         while !self.outcome.interrupted && self.running.len() < self.share.jobs {
             let Some(at) = self.waiting.pop_front() else { return Ok(()) };
-            let cell = &self.sweep.cells[at];
+            let cell = &self.plan.sweep.cells[at];
             let root = Sweep::run_dir(self.dir, cell);
             if RunDir::open(&root).is_ok_and(|(run_dir, _)| run_dir.is_in_use()) {
                 let why = "another process trains it".to_owned();
@@ -182,7 +192,7 @@ impl Jobs<'_> {
     }
 
     fn start(&mut self, at: usize) -> Result<(), Failure> {
-        let cell = &self.sweep.cells[at];
+        let cell = &self.plan.sweep.cells[at];
         let mut command = child::this_program();
         command.args(train_arguments(self.dir, cell, self.share)).args(["--json", "--supervised"]);
         let mut child = child::spawn(command, &log::path(self.dir, cell), None).map_err(Failure::runtime)?;
@@ -200,9 +210,9 @@ impl Jobs<'_> {
     /// What became of a cell's process.
     fn ended(&mut self, at: usize, status: io::Result<ExitStatus>) {
         self.running.remove(&at);
-        let cell = &self.sweep.cells[at];
+        let cell = &self.plan.sweep.cells[at];
         let name = &cell.name;
-        self.standings[at] = standing::of_cell(self.dir, cell, &self.configs[at]);
+        self.standings[at] = standing::of_cell(self.dir, cell, &self.plan.configs[at]);
         let words = match Sweep::state(self.dir, cell) {
             CellState::Ended(ended) if ended.is_whole() => {
                 self.outcome.finished += 1;
@@ -233,13 +243,13 @@ impl Jobs<'_> {
     async fn look(&mut self) {
         let mut rows = Vec::with_capacity(self.running.len());
         for &at in self.running.keys() {
-            let cell = &self.sweep.cells[at];
-            self.standings[at] = standing::of_cell(self.dir, cell, &self.configs[at]);
+            let cell = &self.plan.sweep.cells[at];
+            self.standings[at] = standing::of_cell(self.dir, cell, &self.plan.configs[at]);
             let asked = tokio::time::timeout(ASK_TIMEOUT, status(&Sweep::run_dir(self.dir, cell))).await;
             let words = asked.ok().flatten().unwrap_or_else(|| "…".to_owned());
             rows.push(format!("{}: {words}", cell.name));
         }
-        standing::estimate(self.sweep, &mut self.standings);
+        standing::estimate(self.plan, &[], &mut self.standings);
         self.screen.show(standing::in_words(&self.standings), rows);
     }
 

@@ -1,11 +1,11 @@
 //! How the cells of a sweep stand, and what is left to do.
 
-use super::log;
+use super::{costs::Costs, log, plan::Plan};
 use crate::report;
 use rit_config::{Config, RunDir};
-use rit_record::{Cell, CellState, Ended, Progress, Summary, Sweep, TaskResult, last_progress};
+use rit_record::{Cell, CellState, Ended, Progress, Record, Summary, Sweep, TaskResult, last_progress};
 use serde::Serialize;
-use std::{collections::BTreeMap, path::Path};
+use std::path::Path;
 
 /// How a cell stands.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
@@ -15,24 +15,38 @@ pub enum State {
     Waiting,
     /// Some process trains it.
     Running,
+    /// A process of another host trained it last: whether that lives, this one cannot know.
+    Unknown,
     /// It was killed, interrupted or stopped, and goes on from its newest checkpoint.
     Broken,
     /// It ended with an error; it is tried again by the next `rit sweep`.
     Failed,
+    /// A loss was no finite number, and would be again: it is left alone unless somebody asks for another try.
+    Diverged,
     /// All is done.
     Finished,
 }
 
 impl State {
     /// In the order that they are told in.
-    pub const ALL: [Self; 5] = [Self::Finished, Self::Running, Self::Broken, Self::Failed, Self::Waiting];
+    pub const ALL: [Self; 7] = [
+        Self::Finished,
+        Self::Running,
+        Self::Unknown,
+        Self::Broken,
+        Self::Failed,
+        Self::Diverged,
+        Self::Waiting,
+    ];
 
     pub const fn word(self) -> &'static str {
         match self {
             Self::Waiting => "waiting",
             Self::Running => "running",
+            Self::Unknown => "unknown",
             Self::Broken => "broken off",
             Self::Failed => "failed",
+            Self::Diverged => "diverged",
             Self::Finished => "finished",
         }
     }
@@ -52,42 +66,39 @@ pub struct Standing {
     pub cpu_s: Option<f64>,
     /// What it will yet take, by what others took.
     pub cpu_left_s: Option<f64>,
+    /// Whether these were of other methods or task sets.
+    pub cpu_left_is_rough: bool,
     /// Why it failed.
     pub reason: Option<String>,
 }
 
 /// All cells, in their order.
-pub fn of_all(dir: &Path, sweep: &Sweep, configs: &[Config]) -> Vec<Standing> {
-    let mut standings: Vec<Standing> =
-        sweep.cells.iter().zip(configs).map(|(cell, config)| of_cell(dir, cell, config)).collect();
-    estimate(sweep, &mut standings);
+pub fn of_all(dir: &Path, plan: &Plan) -> Vec<Standing> {
+    let cells = plan.sweep.cells.iter().zip(&plan.configs);
+    let mut standings: Vec<Standing> = cells.map(|(cell, config)| of_cell(dir, cell, config)).collect();
+    estimate(plan, &[], &mut standings);
     standings
 }
 
-/// Says of each cell what it will yet take.
-pub fn estimate(sweep: &Sweep, standings: &mut [Standing]) {
-    let costs = Costs::of(sweep, standings);
-    for (cell, standing) in sweep.cells.iter().zip(standings) {
+/// Says of each cell what it will yet take, by what the finished ones took and these records.
+pub fn estimate(plan: &Plan, records: &[Record], standings: &mut [Standing]) {
+    let mut costs = Costs::of(&plan.sweep, &plan.configs, standings);
+    costs.add_records(records);
+    for ((cell, config), standing) in plan.sweep.cells.iter().zip(&plan.configs).zip(standings) {
         let left = standing.env_steps_max.saturating_sub(standing.env_steps) as f64;
-        let is_open = standing.state != State::Finished;
-        standing.cpu_left_s = if is_open { costs.per_step(cell).map(|it| it * left) } else { Some(0.0) };
+        if standing.state == State::Finished {
+            standing.cpu_left_s = Some(0.0);
+        } else if let Some(cost) = costs.per_step(cell, config) {
+            standing.cpu_left_s = Some(cost.cpu_s * left);
+            standing.cpu_left_is_rough = cost.is_rough;
+        }
     }
 }
 
 /// One cell; what it will yet take is not known without the others.
 pub fn of_cell(dir: &Path, cell: &Cell, config: &Config) -> Standing {
     let root = Sweep::run_dir(dir, cell);
-    let mut standing = Standing {
-        cell: cell.name.clone(),
-        state: State::Waiting,
-        env_steps: 0,
-        env_steps_max: config.training.t_max,
-        mean_return: None,
-        win_rate: None,
-        cpu_s: None,
-        cpu_left_s: None,
-        reason: None,
-    };
+    let mut standing = Standing::waiting(cell, config);
     let run_dir = match (Sweep::state(dir, cell), RunDir::open(&root)) {
         (CellState::Waiting, _) => {
             // One that failed before it began has left nothing but its words.
@@ -109,6 +120,10 @@ pub fn of_cell(dir: &Path, cell: &Cell, config: &Config) -> Standing {
         Some(summary) if summary.ended.is_whole() || !in_use => standing.take(&summary),
         _ => {
             standing.state = if in_use { State::Running } else { State::Broken };
+            if let Some(host) = run_dir.other_host().filter(|_| !in_use) {
+                standing.state = State::Unknown;
+                standing.reason = Some(format!("it is, or was killed, on another host, {host}"));
+            }
             let Progress { env_steps, .. } = last_progress(&run_dir.metrics()).unwrap_or_default();
             standing.env_steps = env_steps;
         }
@@ -117,10 +132,27 @@ pub fn of_cell(dir: &Path, cell: &Cell, config: &Config) -> Standing {
 }
 
 impl Standing {
+    /// Of a cell of which nothing is there.
+    pub fn waiting(cell: &Cell, config: &Config) -> Self {
+        Self {
+            cell: cell.name.clone(),
+            state: State::Waiting,
+            env_steps: 0,
+            env_steps_max: config.training.t_max,
+            mean_return: None,
+            win_rate: None,
+            cpu_s: None,
+            cpu_left_s: None,
+            cpu_left_is_rough: false,
+            reason: None,
+        }
+    }
+
     fn take(&mut self, summary: &Summary) {
         self.state = match summary.ended {
             Ended::Finished | Ended::Until => State::Finished,
             Ended::Stopped | Ended::Interrupted => State::Broken,
+            Ended::Failed if summary.diverged => State::Diverged,
             Ended::Failed => State::Failed,
         };
         self.env_steps = summary.progress.env_steps;
@@ -145,50 +177,6 @@ impl Standing {
     }
 }
 
-/// What an environment step has cost in cells that are finished, in CPU seconds.
-#[derive(Default)]
-struct Costs {
-    /// By all settings but the seed.
-    exact: BTreeMap<String, Vec<f64>>,
-    /// By experiment and algorithm, and by experiment alone.
-    alike: [BTreeMap<String, Vec<f64>>; 2],
-}
-
-fn keys(cell: &Cell) -> [String; 3] {
-    let algorithm = cell.settings.get("algorithm.name").map_or("", String::as_str);
-    [
-        format!("{} {:?}", cell.experiment, cell.settings),
-        format!("{} {algorithm}", cell.experiment),
-        cell.experiment.clone(),
-    ]
-}
-
-impl Costs {
-    fn of(sweep: &Sweep, standings: &[Standing]) -> Self {
-        let mut costs = Self::default();
-        for (cell, standing) in sweep.cells.iter().zip(standings) {
-            let Some(cpu_s) = standing.cpu_s.filter(|_| standing.state == State::Finished) else { continue };
-            let cost = cpu_s / standing.env_steps.max(1) as f64;
-            let [exact, with_algorithm, experiment] = keys(cell);
-            costs.exact.entry(exact).or_default().push(cost);
-            costs.alike[0].entry(with_algorithm).or_default().push(cost);
-            costs.alike[1].entry(experiment).or_default().push(cost);
-        }
-        costs
-    }
-
-    /// The mean over the cells that are most like this one.
-    fn per_step(&self, cell: &Cell) -> Option<f64> {
-        let [exact, with_algorithm, experiment] = keys(cell);
-        let found = self
-            .exact
-            .get(&exact)
-            .or_else(|| self.alike[0].get(&with_algorithm))
-            .or_else(|| self.alike[1].get(&experiment))?;
-        Some(found.iter().sum::<f64>() / found.len() as f64)
-    }
-}
-
 /// How many cells there are in each state, and what is left, in a line.
 pub fn in_words(standings: &[Standing]) -> String {
     let count = |state| standings.iter().filter(|standing| standing.state == state).count();
@@ -198,7 +186,8 @@ pub fn in_words(standings: &[Standing]) -> String {
 }
 
 fn left_in_words(standings: &[Standing]) -> String {
-    let open: Vec<&Standing> = standings.iter().filter(|it| it.state != State::Finished).collect();
+    let is_open = |it: &&Standing| ![State::Finished, State::Diverged].contains(&it.state);
+    let open: Vec<&Standing> = standings.iter().filter(is_open).collect();
     let known: Vec<f64> = open.iter().filter_map(|standing| standing.cpu_left_s).collect();
     match (open.len(), known.len()) {
         (0, _) => String::new(),
@@ -210,7 +199,13 @@ fn left_in_words(standings: &[Standing]) -> String {
             } else {
                 format!(" for {known_count} of the {all} open")
             };
-            format!("; about {} CPU-hours left{of}", hours_in_words(hours))
+            let rough = open.iter().filter(|standing| standing.cpu_left_is_rough).count();
+            let by = if rough == 0 {
+                String::new()
+            } else {
+                format!("; of {rough} by what other methods or task sets took")
+            };
+            format!("; about {} CPU-hours left{of}{by}", hours_in_words(hours))
         }
     }
 }
@@ -258,43 +253,55 @@ mod tests {
         }
     }
 
+    fn config(cell: &Cell) -> Config {
+        super::super::plan::resolve(cell).unwrap()
+    }
+
     fn standing(cell: &Cell, state: State, env_steps: u64, cpu_s: Option<f64>) -> Standing {
-        Standing {
-            cell: cell.name.clone(),
-            state,
-            env_steps,
-            env_steps_max: 1000,
-            mean_return: None,
-            win_rate: None,
-            cpu_s,
-            cpu_left_s: None,
-            reason: None,
-        }
+        Standing { state, env_steps, env_steps_max: 1000, cpu_s, ..Standing::waiting(cell, &config(cell)) }
     }
 
     #[test]
     fn a_cells_cost_is_that_of_the_finished_ones_most_like_it() {
-        let cells = vec![cell("rit", 1), cell("rit", 2), cell("mat", 1), cell("rit", 3)];
-        let sweep = Sweep::new(vec!["algorithm.name".into()], cells);
+        let navigation = Cell { experiment: "cooperative-navigation".into(), ..cell("rit", 1) };
+        let pursuit = Cell { experiment: "predator-prey".into(), ..cell("rit", 1) };
+        let combat = Cell { experiment: "3-8m".into(), ..cell("rit", 1) };
         let states = [
-            (State::Finished, 1000, Some(100.0)),
-            (State::Finished, 1000, Some(300.0)),
-            (State::Waiting, 0, None),
+            (cell("rit", 1), State::Finished, 1000, Some(100.0)),
+            (cell("rit", 2), State::Finished, 1000, Some(300.0)),
+            (cell("mat", 1), State::Waiting, 0, None),
             // What failed says nothing of what a whole one takes.
-            (State::Failed, 10, Some(900.0)),
+            (cell("rit", 3), State::Failed, 10, Some(900.0)),
+            (navigation, State::Finished, 1000, Some(500.0)),
+            (pursuit, State::Waiting, 0, None),
+            (combat.clone(), State::Waiting, 0, None),
         ];
-        let standings: Vec<_> = sweep
-            .cells
-            .iter()
-            .zip(states)
-            .map(|(cell, (state, env_steps, cpu_s))| standing(cell, state, env_steps, cpu_s))
-            .collect();
-        let costs = Costs::of(&sweep, &standings);
-        // (100 + 300) / 2 / 1000 for a step.
-        assert_eq!(costs.per_step(&cell("rit", 9)), Some(0.2));
-        assert_eq!(costs.per_step(&cell("mat", 9)), Some(0.2), "of the same experiment at least");
-        let other = Cell { experiment: "predator-prey".into(), ..cell("rit", 1) };
-        assert_eq!(costs.per_step(&other), None);
+        let mut standings: Vec<_> =
+            states.iter().map(|(cell, state, steps, cpu_s)| standing(cell, *state, *steps, *cpu_s)).collect();
+        let cells: Vec<Cell> = states.into_iter().map(|(cell, ..)| cell).collect();
+        let configs = cells.iter().map(config).collect();
+        let plan = Plan { sweep: Sweep::new(vec!["algorithm.name".into()], cells), configs };
+        estimate(&plan, &[], &mut standings);
+        let left = |at: usize| standings[at].cpu_left_s.map(|it| (it, standings[at].cpu_left_is_rough));
+        // (100 + 300) / 2 / 1000 for a step; MAT's on the same task set are not known.
+        assert_eq!((left(3), left(2)), (Some((198.0, false)), Some((200.0, true))));
+        assert_eq!(
+            (left(0), left(5)),
+            (Some((0.0, false)), Some((500.0, true))),
+            "of the same family at least"
+        );
+        assert_eq!(left(6), None);
+        // A record that lies elsewhere says it.
+        let settings = [("algorithm.name", "rit"), ("environment.task_set", "3-8m")];
+        let record = Record {
+            settings: settings.map(|(key, value)| (key.to_owned(), value.to_owned())).into(),
+            progress: Progress { env_steps: 10, ..Progress::default() },
+            cpu_s: Some(40.0),
+            ended: Some(Ended::Finished),
+            ..Record::default()
+        };
+        estimate(&plan, &[record], &mut standings);
+        assert_eq!((standings[6].cpu_left_s, standings[6].cpu_left_is_rough), (Some(4000.0), false));
     }
 
     #[test]
@@ -311,6 +318,9 @@ mod tests {
         );
         (all[1].cpu_left_s, all[2].cpu_left_s) = (Some(18.0), Some(36.0));
         assert!(in_words(&all).ends_with("; about 0.0150 CPU-hours left"), "54 s are 0.015 h");
+        all[1].cpu_left_is_rough = true;
+        assert!(in_words(&all).ends_with("hours left; of 1 by what other methods or task sets took"));
+        all[1].cpu_left_is_rough = false;
         all[2].cpu_left_s = None;
         assert!(
             in_words(&all).ends_with("about 0.0050 CPU-hours left for 1 of the 2 open"),
