@@ -1,4 +1,4 @@
-//! Settings that an older build wrote down, as this one says them.
+//! Settings that an older build wrote down, as this one says them; and settings of a run that changes none.
 
 use crate::{ConfigError, resolve, saved::KNOWN_SINCE};
 use std::collections::BTreeMap;
@@ -18,6 +18,17 @@ pub fn completed(mut settings: BTreeMap<String, String>) -> BTreeMap<String, Str
         }
     }
     settings
+}
+
+/// Every setting of a run on this task set with this method for which nothing else is set.
+///
+/// # Errors
+/// When there is no such task set or method.
+pub fn preset_settings(task_set: &str, method: &str) -> Result<BTreeMap<String, String>, ConfigError> {
+    today(&BTreeMap::from([
+        ("environment.task_set".to_owned(), task_set.to_owned()),
+        ("algorithm.name".to_owned(), method.to_owned()),
+    ]))
 }
 
 /// What this build makes of them, every key.

@@ -20,7 +20,7 @@ mod run_lock;
 mod run_place;
 mod saved;
 
-pub use completed::completed;
+pub use completed::{completed, preset_settings};
 pub use config::{
     Actors, Algorithm, Backend, Checkpoints, Config, Environment, Evaluation, KeepBest, Learner, Network,
     OptimizerName, SpawnRotate, StarCraft, Tls, Training, Until, Web, WebListen, World,

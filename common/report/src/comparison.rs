@@ -2,6 +2,7 @@
 
 use crate::{ReportError, error::OtherKind, measure::Measure, paper};
 use rit_algo::Regime;
+use rit_config::preset_settings;
 use rit_env::{Split, TaskSet};
 use rit_record::Record;
 use std::collections::{BTreeMap, BTreeSet};
@@ -203,11 +204,14 @@ fn label(run: &Record, task_set: &str, by: &[String]) -> String {
     if run.settings.get(PERMUTATION).is_some_and(|value| value == "false") && is_permuted(&label) {
         label += NO_PERMUTATION;
     }
+    let preset = preset_settings(task_set, run.method().unwrap_or("rit")).unwrap_or_default();
     for key in by {
         let word = key.rsplit('.').next().unwrap_or(key);
         match value(run, key) {
             // It is the label already, or its values are in the label.
             Some(value) if *value == label => {}
+            // Runs that change nothing are what the method's plain name means.
+            Some(value) if preset.get(key) == Some(value) => {}
             _ if ["algorithm.name", PERMUTATION].contains(&key.as_str()) => {}
             Some(value) if word == "folder" => label += &format!(" {value}"),
             Some(value) => label += &format!(" {word}={value}"),
