@@ -15,7 +15,7 @@ use rit_algo::{
     Method, ModelConfig, PpoConfig, Regime, RoleConfig, TerminalStates, UpdateConfig, method::Encoder,
 };
 use rit_env::{
-    EnvironmentOptions, Split, Task, TaskSet,
+    EnvironmentOptions, Physics, Split, Task, TaskSet,
     combat::{CombatOptions, StatsVersion, world::ScriptedMedivac},
 };
 use rit_episode::{Dims, RunSeed};
@@ -55,6 +55,7 @@ pub struct Environment {
     pub view_radius: f32,
     #[serde(serialize_with = "number::shortest")]
     pub approach_shaping: f32,
+    pub physics: Physics,
     pub spawn_rotate: SpawnRotate,
     pub stats: StatsVersion,
     pub enemy_medivac: ScriptedMedivac,
@@ -373,11 +374,13 @@ impl Config {
 
     /// How the environments differ from what their task says.
     pub fn environment_options(&self) -> EnvironmentOptions {
-        let Environment { view_radius, approach_shaping, spawn_rotate, stats, enemy_medivac, .. } =
-            self.environment;
+        let Environment {
+            view_radius, approach_shaping, physics, spawn_rotate, stats, enemy_medivac, ..
+        } = self.environment;
         EnvironmentOptions {
             view_radius: view_radius.is_finite().then_some(view_radius),
             approach_shaping,
+            physics,
             combat: CombatOptions {
                 spawn_rotate: spawn_rotate.rotates(),
                 stats,

@@ -6,7 +6,7 @@ use crate::{
 };
 use rit_algo::{Method, Regime};
 use rit_env::{
-    TaskSet,
+    Physics, TaskSet,
     combat::{StatsVersion, world::ScriptedMedivac},
 };
 use std::collections::BTreeMap;
@@ -84,6 +84,7 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
         ("environment.stats", *stats != StatsVersion::default() && !is_combat),
         ("environment.enemy_medivac", *enemy_medivac != ScriptedMedivac::default() && !is_combat),
         ("environment.approach_shaping", config.environment.approach_shaping != 0.0 && !task_set.has_prey()),
+        ("environment.physics", config.environment.physics != Physics::default() && !task_set.has_physics()),
         (
             "environment.view_radius",
             config.environment.view_radius.is_finite() && !task_set.has_view_radius(),

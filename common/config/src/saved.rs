@@ -13,7 +13,8 @@ use toml::{Table, Value};
 const FORMAT_VERSION: i64 = 1;
 
 /// Keys of which builds that did not know them did what the default says, so that it is no guess.
-pub(crate) const KNOWN_SINCE: [&str; 2] = ["environment.backend", "algorithm.reward_scale"];
+pub(crate) const KNOWN_SINCE: [&str; 3] =
+    ["environment.backend", "environment.physics", "algorithm.reward_scale"];
 
 /// Its key, the first of the file.
 const KEY: &str = "format_version";

@@ -54,8 +54,22 @@ pub struct EnvironmentOptions {
     /// Predator and prey: [`Step::shaping`] is this · what a step takes off Σ_predators distance to the nearest
     /// prey.
     pub approach_shaping: f32,
+    /// Cooperative navigation: whose world it is.
+    pub physics: Physics,
     /// Of combat.
     pub combat: CombatOptions,
+}
+
+/// Which release of the multi-agent particle environment a particle world follows.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Physics {
+    /// That of Lowe et al. (2017), which the paper trained on.
+    #[default]
+    Original,
+    /// The package mpe2 (1.1): a body moves by the velocity that it had before the step, global and local rewards count
+    /// half, no agent collides with itself, and an episode of full length is truncated.
+    Mpe2,
 }
 
 /// What went wrong with an environment. Its name is what failures are counted under.

@@ -24,8 +24,8 @@ mod task_set;
 mod unknown_name;
 
 pub use environment::{
-    BodyKind, Environment, EnvironmentError, EnvironmentOptions, FailureKind, LinkKind, Scene, SceneBody,
-    SceneLink, SceneUnit, Spec, Step,
+    BodyKind, Environment, EnvironmentError, EnvironmentOptions, FailureKind, LinkKind, Physics, Scene,
+    SceneBody, SceneLink, SceneUnit, Spec, Step,
 };
 pub use factory::{Embedded, EnvironmentFactory};
 pub use foreign::{ForeignSet, ForeignTask};

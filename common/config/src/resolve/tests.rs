@@ -108,6 +108,8 @@ fn errors_name_the_key_and_the_remedy() {
             "environment.approach_shaping=5",
             "environment.approach_shaping means nothing to matrix-game; leave it out",
         ),
+        ("environment.physics=mpe2", "environment.physics means nothing to matrix-game; leave it out"),
+        ("environment.physics=mpe", "environment.physics = \"mpe\" is none of its choices: original, mpe2"),
         ("environment.view_radius=1", "environment.view_radius means nothing to matrix-game; leave it out"),
         ("network.n_heads=3", "network.attention_dim = 64 is not a multiple of network.n_heads = 3"),
         ("algorithm.mixing=vdn", "algorithm.mixing must be \"network\" or \"sum\""),

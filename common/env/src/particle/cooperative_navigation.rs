@@ -1,13 +1,16 @@
 //! Cooperative navigation (paper, section VI-A): n agents cover n landmarks without running into each other.
-//! Original "simple spread" rewards, paid as their sum over agents.
+//! "Simple spread" rewards, the original's or mpe2's, paid as their sum over agents.
 
 use super::world::{Body, World, spec, squared_distance_to_nearest};
-use crate::{BodyKind, Environment, EnvironmentError, EnvironmentOptions, Scene, Spec, Step};
+use crate::{BodyKind, Environment, EnvironmentError, EnvironmentOptions, Physics, Scene, Spec, Step};
 use rit_episode::{Action, Observation, Rng};
 
 const AGENT: Body =
     Body { collides: true, movable: true, acceleration: 5.0, ..Body::new(BodyKind::Agent, 0.15) };
 const LANDMARK: Body = Body::new(BodyKind::Landmark, 0.05);
+
+/// Of global and of local rewards in mpe2: its `local_ratio`, and what is left.
+const MPE2_SHARE: f32 = 0.5;
 
 /// The task (n, n). Entities: the agents, then the landmarks.
 #[derive(Debug)]
@@ -31,7 +34,7 @@ impl CooperativeNavigation {
     }
 
     /// The sum over agents of −(Σ_landmarks distance of the nearest agent) − (number of agents it overlaps,
-    /// itself included as in the original).
+    /// itself included as in the original). In mpe2 half of it, and no agent overlaps itself.
     fn team_reward(&self) -> f32 {
         let (agents, landmarks) = self.world.bodies.split_at(self.world.n_agents());
         let mut uncovered = 0.0;
@@ -39,12 +42,16 @@ impl CooperativeNavigation {
             let places = agents.iter().map(|agent| agent.position);
             uncovered += squared_distance_to_nearest(landmark.position, places).sqrt();
         }
-        // Each agent overlaps itself; two agents that overlap count each other.
-        let mut overlaps = agents.len();
+        // Two agents that overlap count each other.
+        let mut overlaps = 0;
         for (index, agent) in agents.iter().enumerate() {
             overlaps += 2 * agents[..index].iter().filter(|other| agent.overlaps(other)).count();
         }
-        -(agents.len() as f32 * uncovered + overlaps as f32)
+        let n = agents.len() as f32;
+        match self.world.physics() {
+            Physics::Original => -(n * uncovered + (overlaps + agents.len()) as f32),
+            Physics::Mpe2 => -MPE2_SHARE * (n * uncovered + overlaps as f32),
+        }
     }
 }
 

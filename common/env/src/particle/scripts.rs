@@ -6,7 +6,8 @@ use super::world::{
 use crate::BodyKind;
 use rit_episode::{Action, Observation, Turn};
 
-/// What a body without force still travels, per unit of velocity: Δt (0.75 + 0.75² + …) = 0.3.
+/// What a body without force still travels, per unit of velocity: Δt (0.75 + 0.75² + …) = 0.3. In mpe2's physics it is
+/// 0.4, which the script does not know: it turns back a little late there.
 const COAST: f32 = 0.3;
 /// An agent that will come to rest this near to its target does not accelerate: a landmark's radius.
 const CLOSE_ENOUGH: f32 = 0.05;

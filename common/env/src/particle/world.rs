@@ -3,7 +3,7 @@
 //! All bodies have mass 1, so force and acceleration are the same number. Units are the original's own: the
 //! arena spans about ±1, a step lasts [`STEP_SECONDS`].
 
-use crate::{BodyKind, EnvironmentOptions, Scene, SceneBody, Spec};
+use crate::{BodyKind, EnvironmentOptions, Physics, Scene, SceneBody, Spec};
 use rand::RngExt as _;
 use rit_episode::{Action, End, Observation, Rng};
 use std::ops::Range;
@@ -103,6 +103,7 @@ pub(super) struct World {
     pub(super) bodies: Vec<Body>,
     n_agents: usize,
     view_radius: Option<f32>,
+    physics: Physics,
     step: usize,
 }
 
@@ -114,7 +115,11 @@ impl World {
     pub(super) fn new(bodies: Vec<Body>, n_agents: usize, options: EnvironmentOptions) -> Self {
         assert!((1..=bodies.len()).contains(&n_agents), "a world has at least one agent");
         assert!(options.view_radius.is_none_or(|radius| radius >= 0.0), "a view radius is not negative");
-        Self { bodies, n_agents, view_radius: options.view_radius, step: 0 }
+        Self { bodies, n_agents, view_radius: options.view_radius, physics: options.physics, step: 0 }
+    }
+
+    pub(super) fn physics(&self) -> Physics {
+        self.physics
     }
 
     pub(super) fn n_agents(&self) -> usize {
@@ -151,14 +156,18 @@ impl World {
     }
 
     /// Moves all bodies by one step under the forces set and those of contact; returns the end where this
-    /// was the last step. The last step counts as terminal, as the authors store it.
+    /// was the last step. The last step counts as terminal, as the authors store it; in mpe2 it is truncated.
     pub(super) fn advance(&mut self) -> Option<End> {
         self.add_contact_forces();
         for body in self.bodies.iter_mut().filter(|body| body.movable) {
-            integrate(body);
+            integrate(body, self.physics);
         }
         self.step += 1;
-        (self.step >= STEPS).then_some(End::Terminated)
+        let end = match self.physics {
+            Physics::Original => End::Terminated,
+            Physics::Mpe2 => End::Truncated,
+        };
+        (self.step >= STEPS).then_some(end)
     }
 
     /// Adds what each pair of colliding bodies does to each other, in the order of the pairs.
@@ -214,14 +223,19 @@ impl World {
     }
 }
 
-/// Velocity first: v ← 0.75 v + F Δt, capped; then p ← p + v Δt.
-fn integrate(body: &mut Body) {
+/// v ← 0.75 v + F Δt, capped, and p ← p + v Δt: by the new velocity, in mpe2 by the old one.
+fn integrate(body: &mut Body, physics: Physics) {
+    let old_velocity = body.velocity;
     body.velocity = sum(scaled(body.velocity, KEPT_VELOCITY), scaled(body.force, STEP_SECONDS));
     let squared_speed = squared_distance(body.velocity, [0.0; 2]);
     if squared_speed > body.speed_max * body.speed_max {
         body.velocity = scaled(body.velocity, body.speed_max / squared_speed.sqrt());
     }
-    body.position = sum(body.position, scaled(body.velocity, STEP_SECONDS));
+    let velocity = match physics {
+        Physics::Original => body.velocity,
+        Physics::Mpe2 => old_velocity,
+    };
+    body.position = sum(body.position, scaled(velocity, STEP_SECONDS));
 }
 
 /// The force on the first of two colliding bodies, the second feels its opposite; `None` where it is exactly

@@ -1,5 +1,6 @@
 use super::*;
-use rit_episode::{RunSeed, Stream};
+use rit_episode::{End, RunSeed, Stream};
+use serde::Deserialize;
 
 /// The task (2, 2) with its agents and landmarks at these places.
 fn placed(places: [[f32; 2]; 4]) -> CooperativeNavigation {
@@ -51,4 +52,60 @@ fn the_scene_shows_agents_and_landmarks() {
             (BodyKind::Landmark, [-1.0, 0.0], 0.05),
         ]
     );
+}
+
+/// An episode of mpe2's simple_spread, as `tests/mpe2/record.py` writes it.
+#[derive(Deserialize)]
+struct Recorded {
+    n: usize,
+    start: Vec<[f32; 2]>,
+    steps: Vec<RecordedStep>,
+}
+
+#[derive(Deserialize)]
+struct RecordedStep {
+    actions: Vec<Action>,
+    positions: Vec<[f32; 2]>,
+    velocities: Vec<[f32; 2]>,
+    reward: f32,
+    terminated: bool,
+    truncated: bool,
+}
+
+/// mpe2 computes with 64 bits, this world with 32, and contact multiplies the difference: each step begins where mpe2's did.
+#[test]
+fn mpe2_physics_are_those_of_mpe2() {
+    let episodes: Vec<Recorded> =
+        serde_json::from_str(include_str!("../../../tests/mpe2/simple_spread.json")).unwrap();
+    let rng = &mut RunSeed(0).stream(Stream::Environment, 0);
+    let mut collisions = 0;
+    for Recorded { n, start, steps } in episodes {
+        let options = EnvironmentOptions { physics: Physics::Mpe2, ..EnvironmentOptions::default() };
+        let mut environment = CooperativeNavigation::new(n, options);
+        environment.world.place(&start);
+        assert_eq!(steps.len(), environment.spec().steps_max);
+        for (at, expected) in steps.iter().enumerate() {
+            let step = environment.step(&expected.actions, rng).unwrap();
+            let agents = &mut environment.world.bodies[..n];
+            for ((agent, &position), &velocity) in
+                agents.iter_mut().zip(&expected.positions).zip(&expected.velocities)
+            {
+                let near = |a: [f32; 2], b: [f32; 2]| (a[0] - b[0]).abs().max((a[1] - b[1]).abs()) < 2e-5;
+                let is_there = near(agent.position, position) && near(agent.velocity, velocity);
+                assert!(is_there, "{n} agents, step {at}: {agent:?}, not {position:?} and {velocity:?}");
+                (agent.position, agent.velocity) = (position, velocity);
+            }
+            assert!((step.reward - expected.reward).abs() < 1e-4, "{n} agents, step {at}: {}", step.reward);
+            let end = match (expected.terminated, expected.truncated) {
+                (true, _) => Some(End::Terminated),
+                (false, true) => Some(End::Truncated),
+                (false, false) => None,
+            };
+            assert_eq!(step.end, end);
+            let touching =
+                |index: &usize| agents[..*index].iter().any(|other| other.overlaps(&agents[*index]));
+            collisions += (0..n).filter(touching).count();
+        }
+    }
+    assert!(collisions > 10, "the record shows collisions: {collisions}");
 }

@@ -40,6 +40,16 @@ fn a_free_body_gains_a_tenth_of_its_force_and_loses_a_quarter_of_its_speed() {
 }
 
 #[test]
+fn in_mpe2_the_old_velocity_moves_a_body() {
+    let mut world = world(&[DISC], &[[0.0, 0.0]]);
+    world.physics = Physics::Mpe2;
+    // +x: p = 0, v = 0.1 · 5. Nothing: p = 0.1 · 0.5, v = 0.75 · 0.5. −y: p = 0.05 + 0.0375, v = (0.28125, −0.5).
+    step_to(&mut world, &[2], &[([0.0, 0.0], [0.5, 0.0])]);
+    step_to(&mut world, &[0], &[([0.05, 0.0], [0.375, 0.0])]);
+    step_to(&mut world, &[3], &[([0.0875, 0.0], [0.281_25, -0.5])]);
+}
+
+#[test]
 fn speed_is_capped_and_keeps_its_direction() {
     let capped = Body { acceleration: 3.0, speed_max: 1.0, ..DISC };
     let mut world = world(&[capped], &[[0.0, 0.0]]);
