@@ -1,9 +1,6 @@
 //! Episodes that an actor's environments lost: what the learner is told of them, and when the actor gives up.
 
-use rit_env::{
-    FailureKind,
-    rollout::{LOST_ROUNDS_MAX, LostEpisode},
-};
+use rit_env::{FailureKind, rollout::LostEpisode};
 use rit_proto::v1;
 use std::collections::BTreeMap;
 
@@ -38,14 +35,27 @@ impl Losses {
 }
 
 /// Leases in a row that brought no episode, because the environments lost all of them.
-#[derive(Debug, Default)]
-pub(crate) struct LostLeases(usize);
+#[derive(Debug)]
+pub(crate) struct LostLeases {
+    in_a_row: usize,
+    max: usize,
+}
 
 impl LostLeases {
+    /// After `max` in a row it is time to give up.
+    pub(crate) fn new(max: usize) -> Self {
+        Self { in_a_row: 0, max }
+    }
+
+    /// As many in a row as it takes to give up.
+    pub(crate) fn max(&self) -> usize {
+        self.max
+    }
+
     /// Takes note of a lease; returns the last loss when it is time to give up.
     pub(crate) fn note(&mut self, losses: Losses, brought_any: bool) -> Option<LostEpisode> {
-        self.0 = if brought_any { 0 } else { self.0 + 1 };
-        losses.last.filter(|_| self.0 >= LOST_ROUNDS_MAX)
+        self.in_a_row = if brought_any { 0 } else { self.in_a_row + 1 };
+        losses.last.filter(|_| self.in_a_row >= self.max)
     }
 }
 
@@ -82,7 +92,7 @@ mod tests {
             (0..8).for_each(|number| losses.note(lost(number, FailureKind::Died, "it crashed")));
             losses
         };
-        let mut leases = LostLeases::default();
+        let mut leases = LostLeases::new(3);
         assert_eq!(leases.note(losing(), false), None);
         assert_eq!(leases.note(losing(), false), None);
         assert_eq!(leases.note(losing(), true), None, "one came after all");

@@ -10,7 +10,7 @@ use rit_algo::{Acting, Model};
 use rit_config::Config;
 use rit_env::{
     Split,
-    rollout::{Job, LOST_ROUNDS_MAX, LostEpisode, Rollout},
+    rollout::{Job, LostEpisode, Rollout},
 };
 use rit_episode::wire::{self, EncodeError, Frame, PayloadLayout, RunId};
 use rit_proto::v1::{Done, Lease, Leaving, actor_message::Message};
@@ -27,8 +27,13 @@ pub enum RolloutError {
     #[error(transparent)]
     Weights(#[from] WeightsError),
     /// Environments that fail again and again. The learner was told of it.
-    #[error("{LOST_ROUNDS_MAX} times in a row every episode was lost, the last: {0}")]
-    Environment(LostEpisode),
+    #[error("{rounds} times in a row every episode was lost, the last: {lost}")]
+    Environment {
+        /// As many as `environment.lost_rounds_max` allows.
+        rounds: usize,
+        /// The last.
+        lost: LostEpisode,
+    },
     /// An episode that does not fit the run's dims.
     #[error(transparent)]
     Encode(#[from] EncodeError),
@@ -109,7 +114,8 @@ impl Roller {
                 for last in [Message::Leaving(Leaving {}), done] {
                     let _ = to_learner.blocking_send(last);
                 }
-                return Err(RolloutError::Environment(lost));
+                let rounds = self.lost_leases.max();
+                return Err(RolloutError::Environment { rounds, lost });
             }
             if to_learner.blocking_send(done).is_err() {
                 break;

@@ -8,6 +8,7 @@ use crate::{
 };
 use rit_algo::{ConfigError, Model};
 use rit_config::{Config, RunDir, read_text, resolve};
+use rit_env::FailureKind;
 use rit_episode::wire::{self, PayloadLayout};
 use rit_ipc::{EpisodeSender, OpenError, RunSpace, RunSpaceError};
 use rit_proto::{
@@ -128,9 +129,14 @@ pub enum ActorError {
 }
 
 impl ActorError {
-    /// Whether another process would end the same way with this learner: what it sends is no weights of the model.
+    /// Whether another process would end the same way with this learner: what it sends is no weights of the model, or the
+    /// environments do not work. A program that died may be there again, and its environments work then.
     pub fn is_permanent(&self) -> bool {
-        matches!(self, Self::Rollout(RolloutError::Weights(error)) if error.is_permanent())
+        match self {
+            Self::Rollout(RolloutError::Weights(error)) => error.is_permanent(),
+            Self::Rollout(RolloutError::Environment { lost, .. }) => lost.error.kind != FailureKind::Died,
+            _ => false,
+        }
     }
 
     /// Whether it may be different when the learner is back.
@@ -290,7 +296,7 @@ impl Actor {
             layout,
             run_id: run_id.try_into().map_err(|_| ActorError::RunId)?,
             actor,
-            lost_leases: LostLeases::default(),
+            lost_leases: LostLeases::new(config.environment.lost_rounds_max),
             weights: Weights::new(client, acting_bytes),
             stop: Arc::clone(&stop),
         };
@@ -310,7 +316,7 @@ impl Actor {
             ended = &mut conversation => ended,
             result = &mut rolled => {
                 let error = result.map_err(|_| ActorError::Panicked)?.err();
-                if let Some(RolloutError::Environment(_)) = error {
+                if let Some(RolloutError::Environment { .. }) = error {
                     // The thread has said what was lost, and that it leaves.
                     let _ = tokio::time::timeout(FAREWELL_TIMEOUT, conversation).await;
                 }
@@ -320,7 +326,7 @@ impl Actor {
         // What is being rolled now is no longer wanted; the thread's place in shared memory must be free again.
         stop.store(true, Ordering::Relaxed);
         match rolled.await {
-            Ok(Err(error @ RolloutError::Environment(_))) => Err(error.into()),
+            Ok(Err(error @ RolloutError::Environment { .. })) => Err(error.into()),
             _ => ended,
         }
     }

@@ -13,8 +13,8 @@ use std::{fmt, process::ExitCode};
 /// as `sysexits.h` has it for a failure that passes: the supervisor starts it again.
 pub const UNAVAILABLE: u8 = 75;
 
-/// Exit code of an actor that cannot use what its learner sends, as `sysexits.h` has it for an error of the protocol:
-/// another try would end the same way.
+/// Exit code of an actor that cannot use what its learner sends, or whose environments do not work, as `sysexits.h` has it
+/// for an error of the protocol: another try would end the same way.
 pub const INCOMPATIBLE: u8 = 76;
 
 /// A failed command.
@@ -26,7 +26,7 @@ pub enum Failure {
     Runtime(anyhow::Error),
     /// The system refuses what it may grant later: exit code 75.
     Unavailable(anyhow::Error),
-    /// What the learner sends cannot be used, now or later: exit code 76.
+    /// What the learner sends, or the environments, cannot be used, now or later: exit code 76.
     Incompatible(anyhow::Error),
 }
 
@@ -235,6 +235,22 @@ mod tests {
         }
         // A byte may have been turned on the way, and the next try brings it right.
         assert!(matches!(failure(SnapshotError::Altered(7)), Failure::Runtime(_)));
+    }
+
+    #[test]
+    fn environments_that_do_not_work_end_a_run_and_those_that_died_may_come_back() {
+        use rit_actor::RolloutError;
+        use rit_env::{EnvironmentError, FailureKind};
+        let failure = |kind| {
+            let error = EnvironmentError { kind, detail: "the bridge is out".into() };
+            let lost = LostEpisode { number: 7, task: "two".into(), error };
+            Failure::from(ActorError::Rollout(RolloutError::Environment { rounds: 3, lost }))
+        };
+        for kind in FailureKind::ALL {
+            let failure = failure(kind);
+            assert_eq!(matches!(failure, Failure::Incompatible(_)), kind != FailureKind::Died, "{kind:?}");
+            assert!(failure.to_string().starts_with("3 times in a row every episode was lost, the last: "));
+        }
     }
 
     #[test]

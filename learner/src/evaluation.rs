@@ -44,6 +44,7 @@ pub struct Evaluator {
     tasks: [Vec<Task>; 2],
     factory: Arc<dyn EnvironmentFactory>,
     random_permutation: bool,
+    lost_rounds_max: usize,
     episodes: usize,
     testing_episodes: usize,
 }
@@ -61,6 +62,7 @@ impl Evaluator {
             tasks: [Split::Training, Split::Testing].map(|split| config.tasks(split)),
             factory,
             random_permutation: config.algorithm.random_permutation,
+            lost_rounds_max: config.environment.lost_rounds_max,
             episodes: config.evaluation.episodes,
             testing_episodes: config.evaluation.testing_episodes,
         }
@@ -183,6 +185,7 @@ impl Evaluator {
     fn rollout(&self, task: Task, seed: RunSeed) -> Rollout {
         let seed = seed.derive(&task.to_string(), 0);
         Rollout::new(vec![task], Arc::clone(&self.factory), seed, self.random_permutation)
+            .with_lost_rounds_max(self.lost_rounds_max)
     }
 
     /// Rolls parts of the work until there is none, or it is no longer wanted: then it is `over` for all.

@@ -59,6 +59,7 @@ pub struct Environment {
     pub spawn_rotate: SpawnRotate,
     pub stats: StatsVersion,
     pub enemy_medivac: ScriptedMedivac,
+    pub lost_rounds_max: usize,
     pub python: String,
     pub interpreter: String,
     pub environments_per_worker: usize,

@@ -167,9 +167,10 @@ pub fn all_keys() -> Vec<String> {
 }
 
 /// Keys, or sections, that a run may change when it goes on: no weight follows from them.
-const FREE: [&str; 16] = [
+const FREE: [&str; 17] = [
     "environment.environments_per_worker",
     "environment.interpreter",
+    "environment.lost_rounds_max",
     "environment.timeout_ms",
     "environment.worker_memory_mb",
     "training",

@@ -31,6 +31,7 @@ pub struct Rollout {
     exploration_persistence: f32,
     /// Whether an episode that ends at the task's limit counts as cut off there.
     time_limit_bootstraps: bool,
+    lost_rounds_max: usize,
     /// Worlds that wait for their next episode, by task.
     idle: Vec<Vec<Seated>>,
 }
@@ -98,6 +99,7 @@ impl Rollout {
             random_permutation,
             exploration_persistence: 0.0,
             time_limit_bootstraps: false,
+            lost_rounds_max: LOST_ROUNDS_MAX,
             idle,
         }
     }
@@ -111,6 +113,11 @@ impl Rollout {
     /// methods whose values cannot tell how much time is left.
     pub fn with_time_limit_bootstraps(self, time_limit_bootstraps: bool) -> Self {
         Self { time_limit_bootstraps, ..self }
+    }
+
+    /// Gives up after so many rounds in a row that brought no episode at all; see [`Self::roll_all`].
+    pub fn with_lost_rounds_max(self, lost_rounds_max: usize) -> Self {
+        Self { lost_rounds_max, ..self }
     }
 
     /// Rolls all jobs side by side to their ends and returns what became of them, in the jobs' order. A world whose
@@ -174,7 +181,8 @@ impl Rollout {
     /// As [`Self::roll`]; jobs whose episodes are lost are rolled again, under their numbers.
     ///
     /// # Errors
-    /// The last that was lost when [`LOST_ROUNDS_MAX`] rounds in a row have brought none.
+    /// The last that was lost when too many rounds in a row have brought none: [`LOST_ROUNDS_MAX`], or as many as
+    /// [`Self::with_lost_rounds_max`] says.
     pub fn roll_all(&mut self, policy: &mut dyn Policy, jobs: &[Job]) -> Result<Vec<Episode>, LostEpisode> {
         let mut episodes: Vec<Option<Episode>> = jobs.iter().map(|_| None).collect();
         let mut left: Vec<usize> = (0..jobs.len()).collect();
@@ -192,7 +200,7 @@ impl Rollout {
                 }
             }
             lost_rounds = if lost_ones.len() < left.len() { 0 } else { lost_rounds + 1 };
-            if let Some(lost) = last.filter(|_| lost_rounds >= LOST_ROUNDS_MAX) {
+            if let Some(lost) = last.filter(|_| lost_rounds >= self.lost_rounds_max) {
                 return Err(lost);
             }
             left = lost_ones;
@@ -280,7 +288,7 @@ impl Running {
     }
 }
 
-/// Rounds in a row that may bring no episode at all; then the environments do not work.
+/// Rounds in a row that may bring no episode at all where nobody says how many; then the environments do not work.
 pub const LOST_ROUNDS_MAX: usize = 3;
 
 /// The episodes of jobs none of which was lost.
@@ -471,6 +479,9 @@ mod tests {
         let lost = broken.roll_all(&mut Fixed([0, 2]), &jobs).unwrap_err();
         assert_eq!((lost.number, lost.error.detail.as_str()), (19, "it broke"));
         assert_eq!(worlds.built.load(Ordering::Relaxed), 20 * LOST_ROUNDS_MAX);
+        let (broken, worlds) = brittle(1);
+        assert!(broken.with_lost_rounds_max(1).roll_all(&mut Fixed([0, 2]), &jobs).is_err());
+        assert_eq!(worlds.built.load(Ordering::Relaxed), 20);
     }
 
     #[test]

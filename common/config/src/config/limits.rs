@@ -14,6 +14,7 @@ impl Config {
         vec![
             ("environment.view_radius", self.environment.view_radius.into(), 0.0, f64::INFINITY),
             ("environment.approach_shaping", self.environment.approach_shaping.into(), 0.0, 1e3),
+            ("environment.lost_rounds_max", self.environment.lost_rounds_max.into(), 1.0, COUNT),
             (
                 "environment.environments_per_worker",
                 self.environment.environments_per_worker.into(),
