@@ -120,23 +120,23 @@ class ParallelAdapter(EntityEnv):
         if isinstance(sees, str) and sees not in ("all", "self"):
             raise ValueError(f'sees = {sees!r}; write "all", "self" or a function of the environment')
         self._team_reward, self._sees, self._entities, self._won = team_reward, sees, entities, won
-        self._spaces = {agent: self._observation_space(agent) for agent in self._possible}
-        self._actions = {agent: self._action_count(agent) for agent in self._possible}
-        self._widths = {agent: _width(space) for agent, space in self._spaces.items()}
-        kinds = [(self._widths[agent], self._actions[agent][0]) for agent in self._possible]
-        self._types = sorted(set(kinds))
-        self._type_of = [self._types.index(kind) for kind in kinds]
+        self._spaces = [self._observation_space(agent) for agent in self._possible]
+        self._widths = [_width(space) for space in self._spaces]
+        counts = [self._action_count(agent) for agent in self._possible]
+        self._n_actions_of, self._first_action_of = [count for count, _ in counts], [first for _, first in counts]
+        kinds = list(zip(self._widths, self._n_actions_of))
+        types = sorted(set(kinds))
         self.n_agents = len(self._possible)
-        self.n_actions = max(count for count, _ in self._actions.values())
+        self.n_actions = max(self._n_actions_of)
         self.steps_max = steps_max if steps_max is not None else self._max_cycles()
         self.has_wins = won is not None
-        self._width = max(self._widths.values())
+        self._width = max(self._widths)
         if entities is None:
             self.n_entities = self.n_agents
             names = feature_names or [f"observation.{column}" for column in range(self._width)]
             names = [*names, "alive"]
-            if len(self._types) > 1:
-                names += [f"type.{index}" for index in range(len(self._types))]
+            if len(types) > 1:
+                names += [f"type.{index}" for index in range(len(types))]
         else:
             observations, _ = env.reset(seed=0)
             shape = np.shape(entities(env, observations))
@@ -149,10 +149,18 @@ class ParallelAdapter(EntityEnv):
         self.feature_names = names
         self.n_features = len(names)
         # What most steps need and never changes.
-        self._all_seen = np.ones((self.n_agents, self.n_entities), np.uint8)
-        self._all_available = np.zeros((self.n_agents, self.n_actions), np.uint8)
-        for row, agent in enumerate(self._possible):
-            self._all_available[row, : self._actions[agent][0]] = 1
+        self._own_actions = np.zeros((self.n_agents, self.n_actions), np.uint8)
+        for row, count in enumerate(self._n_actions_of):
+            self._own_actions[row, :count] = 1
+        self._are_alike = min(self._n_actions_of) == self.n_actions and not any(self._first_action_of)
+        if entities is None:
+            # Features that no observation has: of agents that are not there, and of those that are.
+            self._absent = np.zeros((self.n_agents, self.n_features), np.float32)
+            if len(types) > 1:
+                for row, kind in enumerate(kinds):
+                    self._absent[row, self._width + 1 + types.index(kind)] = 1
+            self._present = self._absent.copy()
+            self._present[:, self._width] = 1
 
     def reset(self, seed: int) -> State:
         observations, infos = self.env.reset(seed=seed)
@@ -160,18 +168,23 @@ class ParallelAdapter(EntityEnv):
 
     def step(self, actions: np.ndarray) -> Step:
         alive = self.env.agents
-        joint = {
-            agent: action + self._actions[agent][1]
-            for agent, action in zip(self._possible, actions.tolist())
-            if agent in alive
-        }
+        if self._are_alike and len(alive) == self.n_agents:
+            joint = dict(zip(self._possible, actions.tolist()))
+        else:
+            joint = {
+                agent: action + first
+                for agent, action, first in zip(self._possible, actions.tolist(), self._first_action_of)
+                if agent in alive
+            }
         observations, rewards, terminations, truncations, infos = self.env.step(joint)
         total = float(sum(rewards.values()))
         if self._team_reward == "mean" and rewards:
             total /= len(rewards)
         over = not self.env.agents
-        # They could have gone on, so what they see last still counts.
-        cut = [agent for agent, is_cut in truncations.items() if is_cut and not terminations.get(agent, False)]
+        cut: Collection[Any] = ()
+        if any(truncations.values()):
+            # They could have gone on, so what they see last still counts.
+            cut = [agent for agent, is_cut in truncations.items() if is_cut and not terminations.get(agent, False)]
         won = self._won is not None and bool(self._won(self.env, infos))
         state = self._state(observations, infos, cut)
         return Step(state, total, terminated=over and not cut, truncated=over and bool(cut), won=won)
@@ -184,52 +197,57 @@ class ParallelAdapter(EntityEnv):
     ) -> State:
         agents = self.env.agents
         alive = [agent in observations and (agent in agents or agent in cut) for agent in self._possible]
-        available = self._available(observations, infos, alive)
         if self._entities is None:
             entities = self._own_features(observations, alive)
         else:
             entities = self._entities(self.env, observations)
-        return State(entities, self._observable(alive), available)
+        return State(entities, self._observable(alive), self._available(observations, infos, alive))
 
     def _own_features(self, observations: Mapping[Any, Any], alive: list[bool]) -> np.ndarray:
-        entities = np.zeros((self.n_agents, self.n_features), np.float32)
-        typed = len(self._types) > 1
+        entities = (self._present if all(alive) else self._absent).copy()
         for row, agent in enumerate(self._possible):
             if alive[row]:
-                width = self._widths[agent]
-                entities[row, :width] = _flat(self._spaces[agent], width, _observation(observations[agent]))
+                observation, width = observations[agent], self._widths[row]
+                if type(observation) is not np.ndarray or observation.shape != (width,):
+                    observation = _flat(self._spaces[row], width, _observation(observation))
+                entities[row, :width] = observation
                 entities[row, self._width] = 1
-            if typed:
-                entities[row, self._width + 1 + self._type_of[row]] = 1
         return entities
 
     def _available(
         self, observations: Mapping[Any, Any], infos: Mapping[Any, Any], alive: list[bool]
-    ) -> np.ndarray:
-        available = self._all_available
-        is_own = False
+    ) -> np.ndarray | None:
+        available = None
         for row, agent in enumerate(self._possible):
-            mask = _mask(observations.get(agent), infos.get(agent)) if alive[row] else _NOTHING
-            if mask is None:
-                continue
-            if not is_own:
-                available, is_own = available.copy(), True
+            if alive[row]:
+                observation, info = observations[agent], infos.get(agent)
+                if not info and type(observation) is np.ndarray:
+                    continue
+                mask = _mask(observation, info)
+                if mask is None:
+                    continue
+            else:
+                mask = _NOTHING
+            if available is None:
+                available = self._own_actions.copy()
             available[row] = 0
             if mask is _NOTHING:
                 available[row, 0] = 1
                 continue
-            count = self._actions[agent][0]
+            count = self._n_actions_of[row]
             mask = np.asarray(mask)
             if mask.shape != (count,):
                 raise ValueError(f"the action mask of {agent} has the shape {mask.shape}, not {(count,)}")
             available[row, :count] = mask != 0
+        if available is None and not self._are_alike:
+            return self._own_actions
         return available
 
-    def _observable(self, alive: list[bool]) -> np.ndarray:
+    def _observable(self, alive: list[bool]) -> np.ndarray | None:
         if self._sees == "all":
             if all(alive):
-                return self._all_seen
-            seen = self._all_seen.copy()
+                return None
+            seen = np.ones((self.n_agents, self.n_entities), np.uint8)
         elif self._sees == "self":
             seen = np.eye(self.n_agents, self.n_entities, dtype=np.uint8)
         else:

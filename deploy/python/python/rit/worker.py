@@ -63,7 +63,9 @@ class Opened:
         # Tasks that have fewer than others are filled up.
         self.n_features = n_features or self.own_features
         self.n_actions = n_actions or self.own_actions
-        self.everything = {name: np.ones(shape, np.uint8) for name, shape in self._flag_shapes().items()}
+        self.shapes = {"observable": (self.n, self.m), "available": (self.n, self.own_actions)}
+        self.fillings = {"observable": 0, "available": self.n_actions - self.own_actions}
+        self.everything = {name: self._filled(name, np.ones(shape, np.uint8)) for name, shape in self.shapes.items()}
         self.steps_max, self.steps = int(env.steps_max), 0
         if self.own_features > self.n_features or self.own_actions > self.n_actions:
             raise ValueError(
@@ -81,7 +83,7 @@ class Opened:
     def step(self, actions: bytes) -> bytes:
         if len(actions) != self.n:
             raise ValueError(f"{len(actions)} actions for {self.n} agents")
-        step = self.env.step(np.array(list(actions)))
+        step = self.env.step(np.frombuffer(actions, np.uint8).astype(np.int64))
         if not isinstance(step, Step):
             raise TypeError(f"step returned {type(step).__name__}, not rit.env.Step")
         self.steps += 1
@@ -99,29 +101,28 @@ class Opened:
             entities = np.hstack([entities, filling])
         observable = self._flags("observable", state.observable)
         available = self._flags("available", state.available)
-        if self.n_actions > self.own_actions:
-            filling = np.zeros((self.n, self.n_actions - self.own_actions), np.uint8)
-            available = np.hstack([available, filling])
         end = TERMINATED if step.terminated else TRUNCATED if step.truncated else GOES_ON
         head = STATE_HEAD.pack(step.reward, end, bool(step.won))
-        return b"".join((head, entities.tobytes(), observable.tobytes(), available.tobytes()))
+        return b"".join((head, entities.tobytes(), observable, available))
 
-    def _flag_shapes(self) -> dict[str, tuple[int, int]]:
-        return {"observable": (self.n, self.m), "available": (self.n, self.own_actions)}
-
-    def _flags(self, name: str, given: Any) -> np.ndarray:
-        everything = self.everything[name]
+    def _flags(self, name: str, given: Any) -> bytes:
         if given is None:
-            return everything
-        flags = np.asarray(given)
-        if flags.shape != everything.shape:
-            raise ValueError(f"{name} has the shape {flags.shape}, not {everything.shape}")
+            return self.everything[name]
+        flags, shape = np.asarray(given), self.shapes[name]
+        if flags.shape != shape:
+            raise ValueError(f"{name} has the shape {flags.shape}, not {shape}")
         # The program looks at bytes for itself.
         if flags.dtype != np.uint8:
             if not np.isin(flags, (0, 1)).all():
                 raise ValueError(f"{name} must be 0 or 1 everywhere")
             flags = flags.astype(np.uint8)
-        return flags
+        return self._filled(name, flags)
+
+    def _filled(self, name: str, flags: np.ndarray) -> bytes:
+        filling = self.fillings[name]
+        if filling:
+            flags = np.hstack([flags, np.zeros((self.n, filling), np.uint8)])
+        return flags.tobytes()
 
 
 class Worker:
@@ -130,8 +131,8 @@ class Worker:
     def __init__(self, make: str, requests: int, answers: int) -> None:
         self._make_name, self._requests, self._answers = make, requests, answers
         self._make: Any = None
-        #: Read, and not answered yet.
-        self._unread = bytearray()
+        #: Read; answered up to here.
+        self._unread, self._at = b"", 0
         #: Answered, and not sent yet.
         self._unsent = bytearray()
         self._opened: dict[int, Opened] = {}
@@ -215,17 +216,15 @@ class Worker:
         return states[0] == states[1]
 
     def _read(self, length: int) -> bytes:
-        unread = self._unread
-        while len(unread) < length:
+        while len(self._unread) - self._at < length:
             # Nothing is left to do, so what was done is told: the answers to a round of requests in one go.
             self._flush()
             part = os.read(self._requests, 1 << 16)
             if not part:
                 raise Closed
-            unread += part
-        taken = bytes(unread[:length])
-        del unread[:length]
-        return taken
+            self._unread, self._at = self._unread[self._at :] + part, 0
+        begin, self._at = self._at, self._at + length
+        return self._unread[begin : self._at]
 
     def _write(self, kind: int, index: int, body: bytes) -> None:
         self._unsent += HEADER.pack(len(body), kind, index)
