@@ -101,6 +101,14 @@ def test_what_is_configured():
     np.testing.assert_array_equal(state.observable, [[1, 1, 0, 1], [1, 1, 0, 1], [0, 0, 0, 0]])
 
 
+def test_an_agent_that_waits_for_its_turn_has_nothing_to_choose():
+    env = Duel()
+    adapter = ParallelAdapter(env, turns=True)
+    env.reset = lambda seed: ({"knight": {"observation": np.zeros(4), "action_mask": np.zeros(3)}}, {})
+    env.agents = ["knight"]
+    np.testing.assert_array_equal(adapter.reset(0).available[0], [1, 0, 0])
+
+
 def test_what_cannot_be_adapted_is_said():
     with pytest.raises(ValueError, match='team_reward = .max.; write "sum" or "mean"'):
         ParallelAdapter(Duel(), team_reward="max")

@@ -100,6 +100,7 @@ class ParallelAdapter(EntityEnv):
         entities: Callable[[Any, Mapping[Any, Any]], Any] | None = None,
         feature_names: list[str] | None = None,
         won: Callable[[Any, Mapping[Any, Any]], bool] | None = None,
+        turns: bool = False,
     ) -> None:
         """
         team_reward: ``"sum"`` or ``"mean"`` over the agents that are paid at a step.
@@ -110,6 +111,8 @@ class ParallelAdapter(EntityEnv):
             observations that returns ``(n_entities, n_features)``, the possible agents first.
         feature_names: what its columns are called.
         won: whether the team has won, a function of the environment and of the infos.
+        turns: an agent whose action mask is all zeros is not wrong but waits for its turn, with action 0 alone, as in
+            PettingZoo's classic games.
         """
         self.env = env
         self._possible = list(env.possible_agents)
@@ -120,6 +123,7 @@ class ParallelAdapter(EntityEnv):
         if isinstance(sees, str) and sees not in ("all", "self"):
             raise ValueError(f'sees = {sees!r}; write "all", "self" or a function of the environment')
         self._team_reward, self._sees, self._entities, self._won = team_reward, sees, entities, won
+        self._turns = turns
         self._spaces = [self._observation_space(agent) for agent in self._possible]
         self._widths = [_width(space) for space in self._spaces]
         counts = [self._action_count(agent) for agent in self._possible]
@@ -239,6 +243,8 @@ class ParallelAdapter(EntityEnv):
             if mask.shape != (count,):
                 raise ValueError(f"the action mask of {agent} has the shape {mask.shape}, not {(count,)}")
             available[row, :count] = mask != 0
+            if self._turns and not mask.any():
+                available[row, 0] = 1
         if available is None and not self._are_alike:
             return self._own_actions
         return available
