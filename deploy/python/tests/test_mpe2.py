@@ -31,7 +31,7 @@ testing_episodes = 2
 @pytest.fixture
 def spread(tmp_path, monkeypatch):
     """The page's adapter as a module, and an experiment on it."""
-    _, adapter = snippets("Your own environment")
+    *_, adapter = snippets("Your own environment")
     (tmp_path / "spread.py").write_text(adapter)
     (tmp_path / "spread.toml").write_text(EXPERIMENT)
     monkeypatch.chdir(tmp_path)
