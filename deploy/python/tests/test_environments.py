@@ -123,14 +123,16 @@ def test_a_policy_in_python_acts_as_evaluation_does_to_the_last_bit(tmp_path):
             reward = paid
 
 
-@pytest.mark.parametrize("fault", ["raises", "hangs", "dies", "nan", "mask", "prints", "forks"])
+@pytest.mark.parametrize("fault", ["raises", "hangs", "dies", "nan", "mask", "prints", "forks", "hoards"])
 def test_an_episode_that_is_lost_is_rolled_again_and_changes_nothing(tmp_path, fault):
     undisturbed = train(experiment(tmp_path, training=["2"]), tmp_path / "one", "--steps", 300)
     faults = tmp_path / "faults"
     faults.mkdir()
     path = experiment(tmp_path, training=[f"{fault}-2"], timeout_ms=500)
     run = tmp_path / "two"
-    disturbed = train(path, run, "--steps", 300, RIT_TEST_FAULTS=faults, RIT_TEST_RUN=run)
+    # Address space: an interpreter with NumPy has most of a gigabyte of it.
+    memory = ("--set", "environment.worker_memory_mb=2500")
+    disturbed = train(path, run, "--steps", 300, *memory, RIT_TEST_FAULTS=faults, RIT_TEST_RUN=run)
     assert any(faults.iterdir())
     assert disturbed["weights_digest"] == undisturbed["weights_digest"]
     assert workers(run) == []
@@ -148,11 +150,13 @@ def test_an_episode_that_is_lost_is_rolled_again_and_changes_nothing(tmp_path, f
         ("mask", "bad answer: agent 0 has no available action"),
         ("blind", "bad answer: agent 0 sees others and not itself"),
         ("nothing", "AttributeError"),
+        ("hoards", "Unable to allocate 3.00 GiB"),
     ],
 )
 def test_a_broken_promise_is_said_in_words(tmp_path, fault, words):
     path = experiment(tmp_path, training=["2"], timeout_ms=500)
-    done = rit("env", "check", path, "--tasks", f"{fault}-2", check=False)
+    memory = ("--set", "environment.worker_memory_mb=2500")
+    done = rit("env", "check", path, "--tasks", f"{fault}-2", *memory, check=False)
     assert done.returncode == 1 and f"task {fault}-2, episode 0, after 2 steps: " in done.stderr, done.stderr
     assert words in done.stderr
 
@@ -202,6 +206,20 @@ def test_a_run_whose_environments_always_fail_ends_with_the_reason(tmp_path):
     done = rit("train", path, "--run-dir", tmp_path / "run", "--steps", 100, "--seed", 3, check=False)
     assert done.returncode == 1
     assert "RuntimeError: the bridge is out" in done.stderr, done.stderr
+
+
+def test_an_actor_whose_environments_always_fail_ends_the_run_once_the_limit_is_reached(tmp_path):
+    """The learner's evaluations go well; what the actor rolls does not."""
+    path, run = experiment(tmp_path, training=["training-2"]), tmp_path / "run"
+    limit = ("--set", "environment.lost_rounds_max=2", "--set", "web.listen=off")
+    done = rit("train", path, "--run-dir", run, "--actors", 1, "--steps", 100, "--seed", 3, *limit, check=False)
+    assert done.returncode == 1
+    assert "2 times in a row every episode was lost, the last: " in done.stderr, done.stderr
+    assert "RuntimeError: the bridge is out (" in done.stderr and "worlds.py" in done.stderr
+    assert "is restarted" not in done.stderr
+    log = (run / "logs/actor-0.log").read_text()
+    assert log.count("Traceback (most recent call last)") == 1, log
+    assert json.loads((run / "summary.json").read_text())["ended"] == "failed"
 
 
 def test_no_worker_outlives_a_run_whatever_dies(tmp_path):

@@ -119,6 +119,13 @@ class Faulty(Gather):
         print("x" * 100_000, flush=True)
         os.write(1, b"straight to the descriptor")
 
+    def hoards(self, step):
+        self.hoard = np.ones(3 << 30, np.uint8)
+
+    def training(self, step):
+        if b"\0actor\0" in Path(f"/proc/{os.getppid()}/cmdline").read_bytes():
+            raise RuntimeError("the bridge is out")
+
     def forks(self, step):
         if os.fork() == 0:
             time.sleep(1000)
