@@ -42,7 +42,7 @@ fn joint(episode: &Episode, coalition: usize) -> Vec<Action> {
     episode.actions.iter().enumerate().map(taken).collect()
 }
 
-/// The learned game of every step, with utilities by these decision orders (rows of the episode).
+/// The learned game of every step, with utilities by these decision orders (rows of the episode), in the rewards' unit.
 ///
 /// # Errors
 /// When the method has no utilities.
@@ -52,6 +52,8 @@ pub fn learned(
     orders: &[Vec<usize>],
 ) -> Result<Vec<StepGame>, Failure> {
     let n = episode.n_agents;
+    // What was learned of scaled rewards is compared with rewards.
+    let in_rewards = |value: f32| f64::from(value) / f64::from(trained.config.algorithm.reward_scale);
     let value = |episode: &Episode, actions: &[Action]| {
         trained.model.value(&trained.params, episode, actions).ok_or_else(|| {
             let method = trained.model.method().facts().name;
@@ -73,7 +75,7 @@ pub fn learned(
     for coalition in 0..1 << n {
         let q_total = value(episode, &joint(episode, coalition))?.q_total;
         for (step, q_total) in steps.iter_mut().zip(q_total) {
-            step.learned.push(f64::from(q_total));
+            step.learned.push(in_rewards(q_total));
         }
     }
     for order in orders {
@@ -82,7 +84,7 @@ pub fn learned(
         for (step, of_step) in steps.iter_mut().zip(utilities.chunks_exact(n)) {
             let mut by_agent = vec![0.0; n];
             for (&agent, &utility) in order.iter().zip(of_step) {
-                by_agent[agent] = f64::from(utility);
+                by_agent[agent] = in_rewards(utility);
             }
             step.utilities.push(by_agent);
         }
