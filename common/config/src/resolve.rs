@@ -42,7 +42,6 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
     if task_set.is_python() {
         config.environment.task_set = foreign::task_set(&config.environment)?;
     }
-    config.dims().validate()?;
     for (key, value, min, max) in config.limits() {
         value.check(key, min, max)?;
     }
@@ -77,6 +76,8 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
             }
         }
     }
+    // Unknown tasks have no sizes.
+    config.dims().validate()?;
     check_backend(&config)?;
     let is_combat = matches!(task_set, TaskSet::Combat(_));
     let meaningless = [
