@@ -189,26 +189,7 @@ impl Connection {
                 }
             }
         };
-        let garbage = |reason: String| ConnectionError::Garbage { request, reason };
-        let response = Response::decode(bytes).map_err(|error| garbage(error.to_string()))?;
-        if response.id.is_some_and(|theirs| theirs != id) {
-            return Err(garbage(format!("it has the number {}, not {id}", response.id())));
-        }
-        if response.status.is_none() {
-            return Err(garbage("it has no status".into()));
-        }
-        self.status = response.status();
-        match response.response {
-            Some(body) if body.name() == request => {
-                if !response.error.is_empty() {
-                    tracing::warn!(request, errors = ?response.error, "the game warns");
-                }
-                Ok(body)
-            }
-            Some(body) => Err(garbage(format!("it answers {}", body.name()))),
-            None if response.error.is_empty() => Err(garbage("it is empty".into())),
-            None => Err(ConnectionError::Refused { request, reason: shown(&response.error.join("; ")) }),
-        }
+        read_response(&bytes, request, id, &mut self.status)
     }
 
     /// Sends a request and waits for its response, which must be the only one on its way.
@@ -234,6 +215,38 @@ impl Connection {
             }
             error => ConnectionError::Garbage { request, reason: shown(&error) },
         }
+    }
+}
+
+/// Reads a message as the response to the request of this name and number, and the game's state from it.
+///
+/// # Errors
+/// When it is none, or refuses the request.
+pub fn read_response(
+    bytes: &[u8],
+    request: &'static str,
+    id: u32,
+    status: &mut Status,
+) -> Result<response::Response, ConnectionError> {
+    let garbage = |reason: String| ConnectionError::Garbage { request, reason };
+    let response = Response::decode(bytes).map_err(|error| garbage(error.to_string()))?;
+    if response.id.is_some_and(|theirs| theirs != id) {
+        return Err(garbage(format!("it has the number {}, not {id}", response.id())));
+    }
+    if response.status.is_none() {
+        return Err(garbage("it has no status".into()));
+    }
+    *status = response.status();
+    match response.response {
+        Some(body) if body.name() == request => {
+            if !response.error.is_empty() {
+                tracing::warn!(request, errors = ?response.error, "the game warns");
+            }
+            Ok(body)
+        }
+        Some(body) => Err(garbage(format!("it answers {}", body.name()))),
+        None if response.error.is_empty() => Err(garbage("it is empty".into())),
+        None => Err(ConnectionError::Refused { request, reason: shown(&response.error.join("; ")) }),
     }
 }
 

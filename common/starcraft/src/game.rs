@@ -12,7 +12,7 @@ use crate::{
         debug_command::Command, request::Request, response::Response,
     },
     process::GameProcess,
-    unit_types::{CustomTypes, standard_kind},
+    unit_types::CustomTypes,
 };
 use joining::{check_version, create, look_at_the_map};
 use rit_env::combat::{
@@ -241,49 +241,7 @@ impl Game {
     /// # Errors
     /// When one cannot be.
     pub fn raw_units(&self, units: &[Unit], to: &mut Vec<RawUnit>) -> Result<(), StarCraftError> {
-        to.clear();
-        for unit in units {
-            let wrong = |what: String| StarCraftError::Unit { what };
-            let (side, kind) = match unit.owner() {
-                1 => (Side::Ally, self.custom.kind(unit.unit_type())),
-                2 => (Side::Enemy, standard_kind(unit.unit_type())),
-                // Neither side's: what the map is decorated with.
-                _ => continue,
-            };
-            let kind =
-                kind.ok_or_else(|| wrong(format!("type {} of player {}", unit.unit_type(), unit.owner())))?;
-            let pos = unit.pos.unwrap_or_default();
-            let numbers = [
-                pos.x(),
-                pos.y(),
-                unit.health(),
-                unit.health_max(),
-                unit.shield(),
-                unit.shield_max(),
-                unit.energy(),
-                unit.energy_max(),
-                unit.weapon_cooldown(),
-            ];
-            if !numbers.iter().all(|number| number.is_finite()) || unit.health_max() <= 0.0 {
-                return Err(wrong(format!("numbers {numbers:?} of a {kind:?}")));
-            }
-            let [x, y, health, health_max, shield, shield_max, energy, energy_max, weapon_cooldown] = numbers;
-            to.push(RawUnit {
-                side,
-                kind,
-                tag: unit.tag(),
-                x,
-                y,
-                health,
-                health_max,
-                shield,
-                shield_max,
-                energy,
-                energy_max,
-                weapon_cooldown,
-            });
-        }
-        Ok(())
+        self.custom.raw_units(units, to)
     }
 
     /// The replay of all that was played in this game.

@@ -19,7 +19,7 @@ pub mod process;
 mod unit_types;
 mod worlds;
 
-pub use connection::{Connection, ConnectionError};
+pub use connection::{Connection, ConnectionError, read_response};
 pub use error::StarCraftError;
 pub use game::{Game, Setup};
 pub use installation::{Installation, InstallationError, Wanted};

@@ -1,8 +1,11 @@
 //! The numbers of unit types. Enemies are of the game's own types; allies are of types that the map brings along, which
 //! never acquire a target by themselves, and whose numbers depend on the game's version.
 
-use crate::messages::{Unit, UnitTypeData};
-use rit_env::combat::{StatsVersion, UnitType};
+use crate::{
+    error::StarCraftError,
+    messages::{Unit, UnitTypeData},
+};
+use rit_env::combat::{StatsVersion, UnitType, translation::RawUnit, world::Side};
 use std::{collections::BTreeMap, fmt, ops::Range};
 
 /// The map's types lie in a row, in alphabetical order: Baneling, Colossus, Hydralisk, Marauder, Marine, Medivac,
@@ -11,6 +14,11 @@ const ROW: u32 = 9;
 
 /// Numbers beyond which a map's own types may lie.
 const CUSTOM_MIN: u32 = 1900;
+
+/// Beyond this no number of a unit can be: places are cells, the sturdiest unit has some hundred points.
+const NUMBER_MAX: f32 = 1e5;
+/// Nobody has less health when unhurt.
+const HEALTH_MIN: f32 = 1.0;
 
 /// Types that are created to find the row by what they look like, at most.
 const TRIED_MAX: usize = 64;
@@ -55,7 +63,7 @@ impl CustomTypes {
     }
 
     /// By their names in the game's data; `None` unless all are there.
-    pub(crate) fn by_name(data: &[UnitTypeData]) -> Option<Self> {
+    pub fn by_name(data: &[UnitTypeData]) -> Option<Self> {
         let number = |kind: UnitType| {
             let named = data.iter().find(|unit| names(kind).iter().any(|name| unit.name().ends_with(name)));
             named.map(|unit| (kind, unit.unit_id()))
@@ -64,19 +72,22 @@ impl CustomTypes {
     }
 
     /// Types that may be the map's own: one of each is created, to be told by what it looks like.
-    pub(crate) fn candidates(data: &[UnitTypeData]) -> Vec<u32> {
+    pub fn candidates(data: &[UnitTypeData]) -> Vec<u32> {
         let custom = data.iter().map(UnitTypeData::unit_id).filter(|&id| id >= CUSTOM_MIN);
         custom.take(TRIED_MAX).collect()
     }
 
     /// The row of which one of each type looks as it must.
-    pub(crate) fn by_looks(units: &[Unit]) -> Option<Self> {
+    pub fn by_looks(units: &[Unit]) -> Option<Self> {
         let looks: BTreeMap<u32, (f32, f32)> =
             units.iter().map(|unit| (unit.unit_type(), (unit.health_max(), unit.shield_max()))).collect();
         let fits = |first: u32| {
             UnitType::ALL.into_iter().all(|kind| {
                 let stats = kind.stats(StatsVersion::Liberty);
-                looks.get(&(first + offset(kind))) == Some(&(stats.health as f32, stats.shield as f32))
+                // A number from outside may be the greatest there is.
+                let number = first.checked_add(offset(kind));
+                number.and_then(|number| looks.get(&number))
+                    == Some(&(stats.health as f32, stats.shield as f32))
             })
         };
         let firsts = looks.keys().filter_map(|id| id.checked_sub(offset(UnitType::Colossus)));
@@ -91,6 +102,58 @@ impl CustomTypes {
     /// The type of a number.
     pub(crate) fn kind(&self, number: u32) -> Option<UnitType> {
         self.0.iter().find(|(_, own)| **own == number).map(|(&kind, _)| kind)
+    }
+
+    /// Units of both players as the translation takes them.
+    ///
+    /// # Errors
+    /// When one cannot be.
+    pub fn raw_units(&self, units: &[Unit], to: &mut Vec<RawUnit>) -> Result<(), StarCraftError> {
+        to.clear();
+        for unit in units {
+            let wrong = |what: String| StarCraftError::Unit { what };
+            let (side, kind) = match unit.owner() {
+                1 => (Side::Ally, self.kind(unit.unit_type())),
+                2 => (Side::Enemy, standard_kind(unit.unit_type())),
+                // Nobody's: what the map is decorated with.
+                _ => continue,
+            };
+            let kind =
+                kind.ok_or_else(|| wrong(format!("type {} of player {}", unit.unit_type(), unit.owner())))?;
+            let pos = unit.pos.unwrap_or_default();
+            let numbers = [
+                pos.x(),
+                pos.y(),
+                unit.health(),
+                unit.health_max(),
+                unit.shield(),
+                unit.shield_max(),
+                unit.energy(),
+                unit.energy_max(),
+                unit.weapon_cooldown(),
+            ];
+            // NaN is within no limits.
+            let may_be = numbers.iter().all(|number| number.abs() <= NUMBER_MAX);
+            if !may_be || unit.health_max() < HEALTH_MIN {
+                return Err(wrong(format!("numbers {numbers:?} of a {kind:?}")));
+            }
+            let [x, y, health, health_max, shield, shield_max, energy, energy_max, weapon_cooldown] = numbers;
+            to.push(RawUnit {
+                side,
+                kind,
+                tag: unit.tag(),
+                x,
+                y,
+                health,
+                health_max,
+                shield,
+                shield_max,
+                energy,
+                energy_max,
+                weapon_cooldown,
+            });
+        }
+        Ok(())
     }
 
     /// All numbers of a row with their names, as the game's data have them.

@@ -133,6 +133,11 @@ impl CombatSet {
     pub const ALL: [Self; 4] =
         [Self::Marines, Self::StalkersZealots, Self::MarinesMaraudersMedivacs, Self::ColossiStalkersZealots];
 
+    /// Whether its teams may have units of this type.
+    pub fn has(self, kind: UnitType) -> bool {
+        self.core().contains(&kind) || self.support() == Some(kind)
+    }
+
     /// The types that every team has some of: two, or one and none.
     fn core(self) -> &'static [UnitType] {
         match self {

@@ -129,12 +129,23 @@ pub enum UnitOrder {
 
 /// Units that do not make up the battle they should.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{found} units of the {side:?} side where there should be 1 to {TEAM_MAX}")]
-pub struct WrongUnits {
-    /// The side.
-    pub side: Side,
-    /// How many it has.
-    pub found: usize,
+pub enum WrongUnits {
+    /// Too few or too many.
+    #[error("{found} units of the {side:?} side where there should be 1 to {TEAM_MAX}")]
+    Count {
+        /// The side.
+        side: Side,
+        /// How many it has.
+        found: usize,
+    },
+    /// One that the set does not have.
+    #[error("a {kind:?} in a battle of {set}")]
+    Kind {
+        /// What it is.
+        kind: UnitType,
+        /// The set.
+        set: CombatSet,
+    },
 }
 
 /// A unit as the agents know it: one row of the observation.
@@ -191,17 +202,20 @@ impl Translation {
     /// actions call them, by that number: the allies' (8 to 15), then the enemies' (0 to 7).
     ///
     /// # Errors
-    /// When a side has no unit or too many.
+    /// When a unit is none of the set's, or a side has no unit or too many.
     pub fn begin(&mut self, units: &[RawUnit], tags: [&[usize]; 2]) -> Result<(), WrongUnits> {
         self.rows.clear();
         self.steps = 0;
+        if let Some(other) = units.iter().find(|unit| !self.set.has(unit.kind)) {
+            return Err(WrongUnits::Kind { kind: other.kind, set: self.set });
+        }
         for (side, tags) in [Side::Ally, Side::Enemy].into_iter().zip(tags) {
             let first = self.rows.len();
             let of_side = units.iter().filter(|unit| unit.side == side);
             self.rows.extend(of_side.map(|&unit| Row { unit, tag: 0, alive: true }));
             let rows = &mut self.rows[first..];
             if !(1..=TEAM_MAX).contains(&rows.len()) || tags.len() < rows.len() {
-                return Err(WrongUnits { side, found: rows.len() });
+                return Err(WrongUnits::Count { side, found: rows.len() });
             }
             let rank = |unit: &RawUnit| match side {
                 Side::Ally => unit.kind.ally_rank() as u32,
@@ -364,13 +378,14 @@ impl Translation {
         Some((ally.unit.tag, order))
     }
 
-    /// Takes the units after a step; a unit that is missing is dead. Returns what the step paid and whether the episode
+    /// Takes the units after a step; a unit that is missing, or comes back as another, is dead. Returns what the step paid and whether the episode
     /// has ended.
     pub fn advance(&mut self, units: &[RawUnit]) -> Step {
         self.steps += 1;
         let mut earned = 0.0;
         for row in &mut self.rows {
-            let now = units.iter().find(|unit| unit.tag == row.unit.tag).filter(|unit| unit.health > 0.0);
+            let who = |unit: &RawUnit| (unit.tag, unit.side, unit.kind);
+            let now = units.iter().find(|unit| who(unit) == who(&row.unit)).filter(|unit| unit.health > 0.0);
             let vitality = |unit: &RawUnit| f64::from(unit.health) + f64::from(unit.shield);
             if row.alive && row.unit.side == Side::Enemy {
                 let before = vitality(&row.unit);

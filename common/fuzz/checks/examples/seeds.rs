@@ -1,6 +1,6 @@
 //! Writes the inputs that fuzzing begins from: `cargo run -p rit-fuzz-checks --example seeds FOLDER`.
 
-use rit_fuzz_checks::{checkpoint::Run, config, frame, worker};
+use rit_fuzz_checks::{checkpoint::Run, config, frame, starcraft, worker};
 use std::{env, error::Error, fs, path::PathBuf};
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -10,6 +10,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         ("checkpoint", Run::new()?.seeds()),
         ("config", config::seeds()),
         ("worker", worker::seeds()),
+        ("starcraft", [starcraft::seeds(), starcraft::refused()].concat()),
     ] {
         let folder = folder.join(target);
         fs::create_dir_all(&folder)?;

@@ -6,4 +6,5 @@
 pub mod checkpoint;
 pub mod config;
 pub mod frame;
+pub mod starcraft;
 pub mod worker;

@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests are tests too")]
 
-use rit_fuzz_checks::{checkpoint::Run, config, frame, worker};
+use rit_fuzz_checks::{checkpoint::Run, config, frame, starcraft, worker};
 use std::{
     fs,
     panic::{self, AssertUnwindSafe},
@@ -38,6 +38,29 @@ fn checkpoints() {
 #[test]
 fn workers() {
     replay("worker", &worker::seeds(), worker::check);
+}
+
+#[test]
+fn answers_of_a_game() {
+    for (name, input) in starcraft::refused() {
+        assert!(!starcraft::check(&input), "{name} is refused");
+    }
+    replay("starcraft", &starcraft::seeds(), starcraft::check);
+}
+
+/// Every byte of every whole answer changed in a few ways, and every answer cut off everywhere: nothing panics.
+#[test]
+fn changed_answers_of_a_game_are_read_or_refused() {
+    for (_, input) in starcraft::seeds() {
+        for at in 0..input.len() {
+            starcraft::check(&input[..at]);
+            for mask in [0x01, 0x10, 0x80, 0xff] {
+                let mut changed = input.clone();
+                changed[at] ^= mask;
+                starcraft::check(&changed);
+            }
+        }
+    }
 }
 
 #[test]
