@@ -45,7 +45,7 @@ pub fn brief_table(results: &[TaskResult], whole: &str) -> String {
     let mut shown = vec![mean(results)];
     shown.extend(ends(results).into_iter().cloned());
     let left = results.len() + 1 - shown.len();
-    format!("{}{left} tasks between these three and those: {whole}\n", table(&shown))
+    format!("{}{left} more tasks lie between these: {whole}\n", table(&shown))
 }
 
 /// One line a task: name, mean return, win rate where there is one.
@@ -222,7 +222,7 @@ mod tests {
         let results: Vec<TaskResult> = (0..11).map(result).collect();
         let text = brief_table(&results, "`there`");
         let names: Vec<&str> = text.lines().skip(1).filter_map(|line| line.split("  ").next()).collect();
-        let between = "5 tasks between these three and those: `there`";
+        let between = "5 more tasks lie between these: `there`";
         assert_eq!(names, ["mean of 11 tasks", "10z", "9z", "8z", "2z", "1z", "0z", between]);
         assert!(text.contains("mean of 11 tasks        22         5.00     0.950"), "{text}");
         assert_eq!(brief_table(&results[..10], ""), table(&results[..10]));

@@ -67,12 +67,23 @@ impl TaskResult {
     }
 }
 
+/// Of more tasks a line has the mean alone.
+const NAMED_MAX: usize = 10;
+
 /// Results in a line of words.
 pub fn in_words<'a>(results: impl IntoIterator<Item = &'a TaskResult>) -> String {
-    let words = results.into_iter().map(|result| match result.win_rate {
-        Some(win_rate) => format!("{} wins {win_rate:.2}", result.task),
-        None => format!("{} {:.1}", result.task, result.mean_return),
-    });
+    let results: Vec<&TaskResult> = results.into_iter().collect();
+    let said = |name: &str, mean_return: f64, win_rate: Option<f64>| match win_rate {
+        Some(win_rate) => format!("{name} wins {win_rate:.2}"),
+        None => format!("{name} {mean_return:.1}"),
+    };
+    if results.len() > NAMED_MAX {
+        let count = results.len() as f64;
+        let mean_return = results.iter().map(|it| it.mean_return).sum::<f64>() / count;
+        let wins: Option<f64> = results.iter().map(|it| it.win_rate).sum();
+        return said(&format!("mean of {} tasks", results.len()), mean_return, wins.map(|wins| wins / count));
+    }
+    let words = results.iter().map(|it| said(&it.task, it.mean_return, it.win_rate));
     words.collect::<Vec<_>>().join(", ")
 }
 
@@ -178,6 +189,16 @@ mod tests {
         let each = EachEpisode { returns: returns.to_vec(), lengths: lengths.to_vec(), wins: wins.to_vec() };
         let mean_return = returns.iter().map(|&it| f64::from(it)).sum::<f64>() / returns.len() as f64;
         TaskResult { episodes: returns.len() as u64, mean_return, each: Some(each), ..TaskResult::default() }
+    }
+
+    #[test]
+    fn a_line_names_few_tasks_and_has_the_mean_of_many() {
+        let named = |at: usize| TaskResult { task: format!("{at}z"), ..result(&[at as f32], &[1], &[]) };
+        let few: Vec<TaskResult> = (0..2).map(named).collect();
+        assert_eq!(in_words(&few), "0z 0.0, 1z 1.0");
+        let many: Vec<TaskResult> =
+            (0..11).map(|at| TaskResult { win_rate: Some(0.5), ..named(at) }).collect();
+        assert_eq!(in_words(&many), "mean of 11 tasks wins 0.50");
     }
 
     #[track_caller]
