@@ -2,6 +2,7 @@
 
 mod comparison;
 mod ctl;
+mod export;
 mod starcraft;
 mod values;
 
@@ -18,6 +19,7 @@ pub use comparison::{
     SweepOptions,
 };
 pub use ctl::{CtlCommand, CtlOptions};
+pub use export::ExportOptions;
 pub use starcraft::{EndpointOptions, GameOptions, StarCraftCheckOptions};
 
 /// Multi-task multi-agent reinforcement learning with interaction and task representations.
@@ -44,6 +46,8 @@ pub enum Command {
     Evaluate(EvaluateOptions),
     /// Draw episodes of a run's newest checkpoint, or of a script
     Render(RenderOptions),
+    /// Write a run's policy as ONNX, or episodes of a policy as a data set, for others to load
+    Export(ExportOptions),
     /// Ask something of a running learner
     Ctl(CtlOptions),
     /// Watch a run in the terminal; q or Ctrl-C ends the view, not the run

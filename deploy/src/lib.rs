@@ -37,6 +37,7 @@ mod control;
 mod ctl;
 mod evaluate;
 mod experiments;
+mod export;
 mod failure;
 mod finished;
 mod last_words;
@@ -140,6 +141,7 @@ async fn run(cli: Cli) -> Result<ExitCode, Failure> {
         Command::Sweep(options) => sweep::run(options, logs).await,
         Command::Evaluate(options) => evaluate::run(&options),
         Command::Render(options) => render::run(&options),
+        Command::Export(options) => export::run(&options),
         Command::Ctl(options) => ctl::run(options).await,
         Command::Watch(options) => watch::run(&options).await,
         Command::Soak(options) => soak::run(options).await,

@@ -10,7 +10,10 @@ use rit_learner::{
     trainer::evaluation_seed,
 };
 use rit_policy::weights_file;
-use std::{path::Path, sync::Arc};
+use std::{
+    path::{Path, PathBuf},
+    sync::Arc,
+};
 
 /// The policy of a checkpoint, as it is typed.
 const CHECKPOINT: &str = "checkpoint";
@@ -29,6 +32,21 @@ pub struct Player {
     pub weights_digest: Option<String>,
 }
 
+/// A run's configuration, and the file of these weights of it.
+///
+/// # Errors
+/// When it has none.
+pub fn weights_path(run: &Path, which: Which) -> Result<(Config, PathBuf), Failure> {
+    let (run_dir, config) = RunDir::open(run)?;
+    let Some(weights) = checkpoint::weights(&run_dir, &config, which).map_err(Failure::input)? else {
+        let root = run_dir.root().display();
+        return Err(Failure::input_message(format!(
+            "{root} has no checkpoint yet; `rit ctl --run {root} checkpoint` writes one"
+        )));
+    };
+    Ok((config, weights))
+}
+
 /// What a run has come to.
 pub struct Trained {
     /// The run's configuration.
@@ -45,13 +63,7 @@ impl Trained {
     /// # Errors
     /// When it has none, or they are not as they were written.
     pub fn load(run: &Path, which: Which) -> Result<Self, Failure> {
-        let (run_dir, config) = RunDir::open(run)?;
-        let Some(weights) = checkpoint::weights(&run_dir, &config, which).map_err(Failure::input)? else {
-            let root = run_dir.root().display();
-            return Err(Failure::input_message(format!(
-                "{root} has no checkpoint yet; `rit ctl --run {root} checkpoint` writes one"
-            )));
-        };
+        let (config, weights) = weights_path(run, which)?;
         let model = Arc::new(Model::new(config.model()).map_err(Failure::input)?);
         let params = weights_file::load(&weights, model.layout())?;
         Ok(Self { config, model, params })

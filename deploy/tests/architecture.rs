@@ -16,6 +16,7 @@ const CRATES: &[(&str, &[&str])] = &[
     ("common/ipc", &["rit-episode"]),
     ("common/config", &["rit-algo", "rit-env", "rit-episode", "rit-nn"]),
     ("common/policy", &["rit-algo", "rit-config", "rit-episode", "rit-nn"]),
+    ("common/onnx", &["rit-algo", "rit-policy"]),
     ("common/record", &["rit-algo", "rit-config", "rit-env"]),
     ("common/worlds", &["rit-config", "rit-env", "rit-foreign", "rit-starcraft"]),
     ("proto", &[]),

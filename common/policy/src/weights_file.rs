@@ -15,7 +15,7 @@ use std::{
 };
 
 /// The key of the description in the file's metadata: JSON, so that the same weights make the same bytes.
-const DESCRIPTION: &str = "rit";
+pub const DESCRIPTION: &str = "rit";
 /// The key of the digest in files of builds that wrote no description.
 const DIGEST: &str = "digest";
 /// No weights file is longer.
