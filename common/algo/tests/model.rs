@@ -357,3 +357,25 @@ fn saturated_units_are_counted_over_decisions() {
         assert_eq!(share, saturated as f64 / units as f64, "{:?}", networks.case);
     });
 }
+
+#[test]
+fn an_update_clips_by_the_norm_of_the_gradients() {
+    each!(&CASES, |networks| {
+        let episodes = batch(5);
+        let batch: Vec<&Episode> = episodes.iter().collect();
+        let draw = Draw { seed: RunSeed(23), update: 0 };
+        let mut learned = networks.scaled_learner(30.0, networks.params(3));
+        let before = learned.params.clone();
+        let values = learned.learn(&batch, draw).unwrap();
+        let norm = measure(&learned, &values, "grad_norm");
+        assert!(norm > 10.0, "{:?}: {norm} is not clipped", networks.case);
+        let (mut expected, mut optimizer) = (before.clone(), learned.optimizer.clone());
+        optimizer.mean.fill(0.0);
+        optimizer.mean_square.fill(0.0);
+        optimizer.steps = 0;
+        optimizer.step(&mut expected, learned.grads(), (10.0 / (norm + 1e-6)) as f32);
+        assert_ne!(learned.params, before, "{:?}", networks.case);
+        assert_eq!(learned.optimizer.mean_square, optimizer.mean_square, "{:?}", networks.case);
+        assert_eq!(learned.params, expected, "{:?}", networks.case);
+    });
+}

@@ -101,7 +101,13 @@ mod tests {
 
     #[test]
     fn a_difference_is_named() {
-        let settings = [("algorithm.gamma", "0.99"), ("algorithm.epsilon_finish", "0.05"), ("seed", "5")];
+        let settings = [
+            ("algorithm.gamma", "0.99"),
+            ("algorithm.epsilon_finish", "0.05"),
+            ("environment.task_set", "matrix-game"),
+            ("environment.backend", "embedded"),
+            ("seed", "5"),
+        ];
         let settings = settings.map(|(key, value)| (key.to_owned(), value.to_owned())).into();
         let mine = Origin { format_version: FORMAT_VERSION, run_id: "ab".into(), settings };
         assert_eq!(mine.may_go_on_from(&mine), Ok(vec![]));

@@ -236,6 +236,8 @@ pub struct TdLearner<N: ValueNetwork> {
     pub optimizer: Optimizer,
     /// Extended by those of derived layers.
     grads: Vec<f32>,
+    /// Of the parameters' gradients, before clipping.
+    grad_norm: f64,
     /// Online and target parameters, with what is derived from them.
     extended: [Vec<f32>; 2],
     rows: Vec<Rows>,
@@ -265,6 +267,7 @@ impl<N: ValueNetwork> TdLearner<N> {
             target: params[parts.target.clone()].to_vec(),
             optimizer: Optimizer::new(config.optimizer, config.lr, params.len()),
             grads: vec![0.0; parts.layout.derived().len()],
+            grad_norm: 0.0,
             extended: Default::default(),
             rows: (0..shards).map(|_| Rows::default()).collect(),
             shards: (0..shards).map(|_| Shard::default()).collect(),
@@ -303,7 +306,8 @@ impl<N: ValueNetwork> TdLearner<N> {
         pairing: impl FnOnce(usize) -> Vec<usize> + Send,
         see: impl Fn(&SeenShard<'_>) + Sync,
     ) -> Vec<f64> {
-        let Self { network, config, pool, grads, extended, rows, shards, pairs, workers, .. } = self;
+        let Self { network, config, pool, grads, grad_norm, extended, rows, shards, pairs, workers, .. } =
+            self;
         let (network, workers, count) = (&**network, &*workers, shards.len());
         let (derived, parameters) = (network.parts().layout.derived(), self.params.len());
         derived.extend(&self.params, &mut extended[0]);
@@ -340,7 +344,7 @@ impl<N: ValueNetwork> TdLearner<N> {
             sums
         });
         derived.backward(online.params, grads);
-        let grad_norm = optimizer::sum_of_squares(&grads[..parameters]).sqrt();
+        *grad_norm = optimizer::sum_of_squares(&grads[..parameters]).sqrt();
         let filled = update.totals.filled as f64;
         let [td, contrastive, q_total, target, saturated] = sums.common;
         let mut measures = vec![td / filled];
@@ -348,7 +352,7 @@ impl<N: ValueNetwork> TdLearner<N> {
             measures.push(contrastive);
         }
         measures.extend(network.losses(&sums.own));
-        measures.extend([grad_norm, q_total / filled, target / filled]);
+        measures.extend([*grad_norm, q_total / filled, target / filled]);
         if network.parts().gru {
             let units = update.totals.filled_agents * network.parts().memory_dim;
             measures.push(saturated / units as f64);
@@ -356,9 +360,9 @@ impl<N: ValueNetwork> TdLearner<N> {
         measures
     }
 
-    /// One step of the optimiser along the gradients that [`TdLearner::gradients`] left, which are of this norm.
-    pub fn apply(&mut self, grad_norm: f64) {
-        let scale = optimizer::clip_scale(grad_norm, self.config.grad_norm_clip);
+    /// One step of the optimiser along the gradients that [`TdLearner::gradients`] left, clipped.
+    fn apply(&mut self) {
+        let scale = optimizer::clip_scale(self.grad_norm, self.config.grad_norm_clip);
         let parameters = self.params.len();
         self.optimizer.step(&mut self.params, &self.grads[..parameters], scale);
     }

@@ -23,8 +23,7 @@ impl<N: ValueNetwork> Learner for TdLearner<N> {
         let draws = self.network.draw(batch, draw);
         let values = self.gradients(batch, &draws, |rows| draw_pairing(rows, &mut rng));
         NotFinite::check(self.measures(), &values)?;
-        // The norm stands before the two means.
-        self.apply(values[values.len() - 3]);
+        self.apply();
         Ok(values)
     }
 
