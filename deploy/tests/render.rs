@@ -152,7 +152,7 @@ fn what_cannot_be_drawn_is_refused_and_leaves_nothing() {
         refused(&[&["render", "--out", &path(name)], arguments].concat(), message);
     };
     render("a.jpeg", &CHASE, &["a.jpeg", ".gif, .png or .svg"]);
-    render("nowhere/a.gif", &CHASE, &["nowhere/a.gif", "No such file or directory"]);
+    render("nowhere/a.gif", &CHASE, &["nowhere/a.gif", "there is no folder"]);
     let task = ["--policy", "script:chase", "--experiment", "predator-prey", "--task", "predator-prey-0-3"];
     render("a.gif", &task, &["predator-prey-0-3", "predators must be 1 to 64"]);
     let game = ["--policy", "script:random", "--experiment", "matrix-game", "--task", "game-1"];

@@ -116,7 +116,9 @@ fn the_committed_records_make_a_report() {
     let out = folder.path().join("report");
     let results = concat!(env!("CARGO_MANIFEST_DIR"), "/results");
     let arguments = ["report", results, "--out", out.to_str().unwrap(), "--replications", "200"];
-    let made = output(&arguments);
+    refused(&arguments, &["differ in algorithm.encoder (within, beside), algorithm.reward_scale (1.0, 0.1)"]);
+    let by = ["--by", "algorithm.encoder", "--by", "algorithm.reward_scale"];
+    let made = output(&[&arguments[..], &by].concat());
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
     let table = fs::read_to_string(out.join("tables/tasks-predator-prey.md")).unwrap();
     assert!(table.contains("predator-prey-5-2 (unseen)"), "{table}");

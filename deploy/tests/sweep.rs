@@ -330,4 +330,11 @@ fn a_cluster_of_containers_is_told_the_whole_sweep() {
     ] {
         assert!(job.contains(part), "{part} in {job}");
     }
+    // The same from where the file lies, by its name alone.
+    let here = rit(&["sweep", "two methods.toml", "--dir", "runs", "--kubernetes", "here.yaml"])
+        .current_dir(sweep.folder.path())
+        .output()
+        .unwrap();
+    assert!(here.status.success(), "{}", String::from_utf8_lossy(&here.stderr));
+    assert!(fs::read_to_string(sweep.folder.path().join("here.yaml")).unwrap().contains(item));
 }

@@ -43,6 +43,8 @@ impl Job {
             .collect();
         experiments.sort();
         experiments.dedup();
+        // A name alone is of a file in the working directory.
+        let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
         Ok(Self {
             file: file.canonicalize().map_err(Failure::runtime)?,
             dir: dir.to_owned(),
@@ -50,7 +52,7 @@ impl Job {
             at_once,
             queue: queue.map(str::to_owned),
             experiments,
-            folder: std::path::absolute(file.parent().unwrap_or(Path::new(""))).unwrap_or_default(),
+            folder: std::path::absolute(folder).map_err(Failure::runtime)?,
         })
     }
 
