@@ -3,7 +3,7 @@
 //! `NAME.jsonl` is the run's metrics file without the lines of training, its header with the settings as they were at the
 //! end. Of evaluations on schedule it has means alone, which is all that a curve needs; of those at the end every episode.
 //! `NAME.json` is the summary. Builds before there were headers kept a summary inside an object, beside evaluations
-//! of the testing tasks.
+//! of the testing tasks; with what settings they trained, a file [`SETTINGS`] in their folder may say.
 
 use crate::{
     Evaluation, Line, Lines, Occasion, RecordError, Summary, TaskResult, record::settings, shapley,
@@ -16,6 +16,23 @@ use std::{
     io::ErrorKind,
     path::{Path, PathBuf},
 };
+
+/// Settings of the records in its folder that say none themselves, each `section.key` with its value, as a header has them.
+const SETTINGS: &str = "settings.json";
+
+/// The settings of a folder's records that say none; empty where there is no such file.
+pub(crate) fn folder_settings(metrics: &Path) -> Result<BTreeMap<String, String>, RecordError> {
+    let path = metrics.with_file_name(SETTINGS);
+    let text = match rit_config::read_regular(&path, BYTES_MAX) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(BTreeMap::new()),
+        text => text.map_err(RecordError::io(&path))?,
+    };
+    serde_json::from_slice(&text).map_err(|error| RecordError::Other {
+        path,
+        what: "list of settings",
+        why: error.to_string(),
+    })
+}
 
 /// What lies beside the lines.
 #[derive(Debug, Default)]

@@ -125,6 +125,9 @@ impl Record {
         record.shapley = shapley::of_committed(metrics)?;
         let stem = metrics.file_stem().unwrap_or_default().to_string_lossy();
         if record.settings.is_empty() {
+            record.take_settings(committed::folder_settings(metrics)?);
+        }
+        if record.settings.is_empty() {
             record.kind = record.shown_kind();
         }
         record.seed = record.seed.or_else(|| stem.rsplit_once("seed-")?.1.parse().ok());

@@ -59,12 +59,6 @@ impl TaskResult {
         let squares = returns.iter().map(|&it| (f64::from(it) - mean).powi(2)).sum::<f64>();
         Some((squares / (count - 1.0)).sqrt())
     }
-
-    /// Half the width of the 95 % interval of the mean return over episodes, by the normal approximation: 1.96 standard
-    /// errors.
-    pub fn ci95_return(&self) -> Option<f64> {
-        Some(1.959_964 * self.std_return()? / (self.episodes as f64).sqrt())
-    }
 }
 
 /// Of more tasks a line has the mean alone.
@@ -225,7 +219,7 @@ mod tests {
         let found: TaskResult = serde_json::from_str(old).unwrap();
         let expected = TaskResult { episodes: 32, mean_return: -255.851, ..TaskResult::default() };
         assert_eq!(found, expected);
-        assert_eq!((found.std_return(), found.ci95_return()), (None, None));
+        assert_eq!(found.std_return(), None);
         let exploring =
             r#"{"episodes":9,"mean_return":4.5,"win_rate":null,"episodes_total":9,"policy_lag":1}"#;
         let found: TaskResult = serde_json::from_str(exploring).unwrap();
@@ -253,12 +247,11 @@ mod tests {
     }
 
     /// By hand: of 1, 2, 3, 4 the mean is 2.5, the squares are 2.25 + 0.25 + 0.25 + 2.25 = 5, 5 / 3 = 1.666…, whose root
-    /// is 1.290994; 1.959964 · 1.290994 / 2 = 1.265151.
+    /// is 1.290994.
     #[test]
     fn spread_is_that_of_the_sample() {
         let result = result(&[1.0, 2.0, 3.0, 4.0], &[1; 4], &[]);
         assert!((result.std_return().unwrap() - 1.290_994).abs() < 1e-6);
-        assert!((result.ci95_return().unwrap() - 1.265_151).abs() < 1e-6);
         assert_eq!(self::result(&[1.0], &[1], &[]).std_return(), None);
     }
 }

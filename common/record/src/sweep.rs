@@ -1,6 +1,7 @@
 //! A sweep: runs that are compared with each other, in one folder.
 //!
-//! `sweep.json` says which; the run of each cell lies in `runs/NAME`.
+//! `sweep.json` says which; the run of each cell lies in `runs/NAME`, and what its processes said in `logs/NAME.log`: its
+//! end is all that a cell leaves which fails before it begins.
 
 use crate::{Ended, RecordError, Summary, discover::is_run};
 use rit_config::RunDir;
@@ -19,6 +20,10 @@ const MANIFEST: &str = "sweep.json";
 const FORMAT_VERSION: u32 = 1;
 /// No manifest is longer.
 const BYTES_MAX: u64 = 64 << 20;
+/// No log of a cell is longer.
+const LOG_BYTES_MAX: u64 = 1 << 32;
+/// Of a log's end, what is looked at for its last words, in bytes.
+const LAST_WORDS: usize = 8 << 10;
 
 /// The runs of a sweep.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -105,6 +110,27 @@ impl Sweep {
     /// Where the run of a cell lies.
     pub fn run_dir(dir: &Path, cell: &Cell) -> PathBuf {
         dir.join("runs").join(&cell.name)
+    }
+
+    /// How a command's log says that it failed.
+    pub const ERROR: &str = "error: ";
+
+    /// Where a cell's log lies.
+    pub fn log(dir: &Path, cell: &Cell) -> PathBuf {
+        dir.join("logs").join(format!("{}.log", cell.name))
+    }
+
+    /// The last line of a cell's log, if it has one.
+    pub fn last_words(dir: &Path, cell: &Cell) -> Option<String> {
+        let text = rit_config::read_regular(&Self::log(dir, cell), LOG_BYTES_MAX).ok()?;
+        let tail = String::from_utf8_lossy(&text[text.len().saturating_sub(LAST_WORDS)..]).into_owned();
+        tail.lines().rev().find(|line| !line.trim().is_empty()).map(|line| line.trim().to_owned())
+    }
+
+    /// Why a cell of which there is no run failed; nothing of one that was not tried.
+    pub fn failure(dir: &Path, cell: &Cell) -> Option<String> {
+        let words = Self::last_words(dir, cell)?;
+        words.strip_prefix(Self::ERROR).map(str::to_owned)
     }
 
     /// How a cell stands.

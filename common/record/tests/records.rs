@@ -189,7 +189,13 @@ fn results() -> PathBuf {
 
 #[test]
 fn records_of_older_builds_are_read() {
-    let record = Record::read(&results().join("predator-prey/seed-2.jsonl")).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let there = folder.path().join("predator-prey");
+    fs::create_dir(&there).unwrap();
+    for name in ["seed-2.jsonl", "seed-2.json"] {
+        fs::copy(results().join("predator-prey").join(name), there.join(name)).unwrap();
+    }
+    let record = Record::read(&there.join("seed-2.jsonl")).unwrap();
     assert_eq!((record.seed, record.folder.as_str(), record.method()), (Some(2), "predator-prey", None));
     assert_eq!((record.is_whole(), record.progress.env_steps), (true, 5_050_000));
     assert_eq!(record.kind["evaluation.every_env_steps"], "50000");
@@ -200,6 +206,42 @@ fn records_of_older_builds_are_read() {
     assert_eq!(testing.tasks["predator-prey-4-2"].episodes, 1000, "the one of most episodes");
     let last = record.latest(Occasion::Final, Split::Training).unwrap();
     assert!(last.tasks.values().all(|result| result.episodes == 32 && result.each.is_none()));
+
+    // A file beside it says what it was trained with: it is of a kind with records that say so themselves.
+    fs::write(
+        there.join("settings.json"),
+        r#"{"algorithm.name":"rit","environment.task_set":"predator-prey"}"#,
+    )
+    .unwrap();
+    let told = Record::read(&there.join("seed-2.jsonl")).unwrap();
+    assert_eq!((told.seed, told.method(), told.task_set()), (Some(2), Some("rit"), Some("predator-prey")));
+    assert!(!told.kind.contains_key("tasks") && told.evaluations == record.evaluations, "{:?}", told.kind);
+    fs::write(there.join("settings.json"), r#"{"algorithm.gamma":0.8}"#).unwrap();
+    let error = Record::read(&there.join("seed-2.jsonl")).unwrap_err().to_string();
+    assert!(error.contains("settings.json is no list of settings: invalid type"), "{error}");
+}
+
+/// Old records and new ones in one folder are averaged where their settings are equal: each key that results follow from.
+#[test]
+fn settings_beside_older_records_are_those_of_a_new_one() {
+    for (folder, changes) in [
+        ("cooperative-navigation", &[][..]),
+        ("cooperative-navigation-gamma-0.8", &["algorithm.gamma=0.8"]),
+        ("predator-prey", &["algorithm.gamma=0.8", "environment.approach_shaping=5.0"]),
+        ("predator-prey-pro", &["algorithm.gamma=0.9"]),
+        ("predator-prey-pro-shaping", &["algorithm.gamma=0.8", "environment.approach_shaping=5.0"]),
+    ] {
+        let older = Record::read(&results().join(folder).join("seed-1.jsonl")).unwrap();
+        let task_set = folder.trim_end_matches("-gamma-0.8").trim_end_matches("-shaping");
+        let scratch = tempfile::tempdir().unwrap();
+        let settings = changes.iter().chain(&["evaluation.every_env_steps=50000"]);
+        let settings: Vec<_> = settings.map(|it| set(it).unwrap()).collect();
+        let text = format!("environment.task_set = \"{task_set}\"");
+        let config = resolve(&text, "test", &settings).unwrap();
+        let root = scratch.path().join("run");
+        OwnedRunDir::create(&root, &config).unwrap();
+        assert_eq!(older.kind, Record::read(&root).unwrap().kind, "{folder}");
+    }
 }
 
 #[test]

@@ -110,7 +110,7 @@ async fn one(
     let ended = crate::train::run(options, logs).await;
     if let Err(failure) = &ended {
         // Whatever becomes of the line, the exit code says it.
-        let _ = log::append(dir, cell, &format!("{}{failure}", log::ERROR));
+        let _ = log::append(dir, cell, &format!("{}{failure}", Sweep::ERROR));
     }
     ended
 }

@@ -195,7 +195,7 @@ impl Jobs<'_> {
         let cell = &self.plan.sweep.cells[at];
         let mut command = child::this_program();
         command.args(train_arguments(self.dir, cell, self.share)).args(["--json", "--supervised"]);
-        let mut child = child::spawn(command, &log::path(self.dir, cell), None).map_err(Failure::runtime)?;
+        let mut child = child::spawn(command, &Sweep::log(self.dir, cell), None).map_err(Failure::runtime)?;
         self.running.insert(at, child.id());
         self.children.spawn(async move {
             // Held open: its end tells the run that this process has gone.
@@ -227,11 +227,11 @@ impl Jobs<'_> {
             }
             _ if self.outcome.interrupted => "ended before it began".to_owned(),
             _ => {
-                let why = log::last_words(self.dir, cell).unwrap_or_else(|| match status {
+                let why = Sweep::last_words(self.dir, cell).unwrap_or_else(|| match status {
                     Ok(status) => status.to_string(),
                     Err(error) => error.to_string(),
                 });
-                let why = why.trim_start_matches(log::ERROR).to_owned();
+                let why = why.trim_start_matches(Sweep::ERROR).to_owned();
                 self.outcome.failed.push((name.clone(), why.clone()));
                 format!("failed: {why}")
             }

@@ -102,9 +102,8 @@ pub fn of_cell(dir: &Path, cell: &Cell, config: &Config) -> Standing {
     let run_dir = match (Sweep::state(dir, cell), RunDir::open(&root)) {
         (CellState::Waiting, _) => {
             // One that failed before it began has left nothing but its words.
-            if let Some(reason) = log::last_words(dir, cell).filter(|words| words.starts_with(log::ERROR)) {
-                standing.state = State::Failed;
-                standing.reason = Some(reason.trim_start_matches(log::ERROR).to_owned());
+            if let Some(reason) = Sweep::failure(dir, cell) {
+                (standing.state, standing.reason) = (State::Failed, Some(reason));
             }
             return standing;
         }
