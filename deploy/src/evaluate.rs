@@ -34,10 +34,18 @@ pub fn run(options: &EvaluateOptions) -> Result<ExitCode, Failure> {
 /// A result as records have it, with the spread of its episodes.
 fn in_json(result: &TaskResult) -> Result<Value, serde_json::Error> {
     let mut value = serde_json::to_value(result)?;
-    let ends = result.ci95_return().map(|half| [result.mean_return - half, result.mean_return + half]);
+    let ends = half_width(result).map(|half| [result.mean_return - half, result.mean_return + half]);
     value["std_return"] = json!(result.std_return());
     value["ci95_return"] = json!(ends);
     Ok(value)
+}
+
+/// Half the width of the mean return's 95 % interval over episodes, of Student's t; none of fewer than two episodes, or where
+/// only the mean is known.
+fn half_width(result: &TaskResult) -> Option<f64> {
+    let returns: Vec<f64> = result.each.as_ref()?.returns.iter().map(|&it| f64::from(it)).collect();
+    let interval = rit_statistics::t_interval(&returns)?;
+    Some((interval.high - interval.low) / 2.0)
 }
 
 /// What a line of the table says.
@@ -58,7 +66,7 @@ impl Row {
             episodes: result.episodes,
             mean_return: result.mean_return,
             std_return: result.std_return(),
-            ci95_return: result.ci95_return(),
+            ci95_return: half_width(result),
             win_rate: result.win_rate,
         }
     }
@@ -119,16 +127,16 @@ mod tests {
         TaskResult { task: task.into(), episodes, mean_return, win_rate, each: Some(each), exploring: None }
     }
 
-    /// 1, 2, 3, 4: mean 2.5, deviation 1.29, half width 1.265 (by hand in the record's tests). With a task of no spread at
-    /// 10.0 the mean is 6.25 and the half width 1.265 / 2 = 0.633.
+    /// 1, 2, 3, 4: mean 2.5, deviation 1.291 (by hand in the record's tests), and t(3) = 3.182 of tables makes the half width
+    /// 3.182 · 1.291 / 2 = 2.054. With a task of no spread at 10.0 the mean is 6.25 and the half width 2.054 / 2 = 1.027.
     #[test]
     fn a_line_says_mean_deviation_and_interval() {
         let results =
             [result("a", &[1.0, 2.0, 3.0, 4.0], Some(0.25)), result("long-name", &[10.0; 4], Some(0.75))];
         let expected = "task       episodes  mean return       std        95 % interval  win rate\n\
-                        a                 4         2.50      1.29         [1.23, 3.77]     0.250\n\
+                        a                 4         2.50      1.29         [0.45, 4.55]     0.250\n\
                         long-name         4        10.00      0.00       [10.00, 10.00]     0.750\n\
-                        mean              8         6.25         -         [5.62, 6.88]     0.500\n";
+                        mean              8         6.25         -         [5.22, 7.28]     0.500\n";
         assert_eq!(table(&results), expected);
         let one = table(&results[..1]);
         assert!(one.lines().count() == 2, "of one task there is nothing to mix: {one}");

@@ -73,13 +73,7 @@ impl Row {
             Some(ended) => ended.word(),
             None => "broken off",
         };
-        let scheduled =
-            |it: &&rit_record::Evaluation| (it.occasion, it.split) == (Occasion::Scheduled, Split::Training);
-        let results = |it: &rit_record::Evaluation| {
-            it.tasks.values().map(|result| (result.mean_return, result.win_rate)).collect()
-        };
-        let evaluations: Vec<Results> = record.evaluations.iter().filter(scheduled).map(results).collect();
-        let (metric, values) = measured(&evaluations);
+        let (metric, values) = measured(&evaluations(&record));
         Self {
             run,
             task_set: record.task_set().map(str::to_owned),
@@ -123,6 +117,16 @@ impl Row {
 
 /// What an evaluation reached on each task: mean return, and win rate where there is one.
 type Results = Vec<(f64, Option<f64>)>;
+
+/// Those of the training tasks, the one at a run's end included; what its best policy came to afterwards is of another kind.
+fn evaluations(record: &Record) -> Vec<Results> {
+    let of_the_run =
+        |it: &&rit_record::Evaluation| it.split == Split::Training && it.occasion != Occasion::Best;
+    let results = |it: &rit_record::Evaluation| {
+        it.tasks.values().map(|result| (result.mean_return, result.win_rate)).collect()
+    };
+    record.evaluations.iter().filter(of_the_run).map(results).collect()
+}
 
 /// The mean over tasks of each evaluation, and what it measures: win rates where all tasks know them, else returns.
 fn measured(evaluations: &[Results]) -> (Option<&'static str>, Vec<f64>) {
@@ -188,6 +192,29 @@ mod tests {
         let mut paths = ["runs/a-10", "runs/a-9", "runs/b-1", "runs/a-9-2"].map(PathBuf::from);
         paths.sort_by_cached_key(|path| natural(path));
         assert_eq!(paths, ["runs/a-9", "runs/a-9-2", "runs/a-10", "runs/b-1"].map(PathBuf::from));
+    }
+
+    /// A run may be shorter than the way to its first evaluation on schedule, or end between two.
+    #[test]
+    fn the_evaluation_at_the_end_counts() {
+        let evaluation = |occasion, split, mean_return| {
+            let result = rit_record::TaskResult { mean_return, ..Default::default() };
+            rit_record::Evaluation {
+                occasion,
+                split,
+                tasks: [("a".to_owned(), result)].into(),
+                ..Default::default()
+            }
+        };
+        let made = [
+            evaluation(Occasion::Scheduled, Split::Training, 1.0),
+            evaluation(Occasion::Scheduled, Split::Testing, 9.0),
+            evaluation(Occasion::Final, Split::Training, 2.0),
+            evaluation(Occasion::Final, Split::Testing, 9.0),
+            evaluation(Occasion::Best, Split::Training, 9.0),
+        ];
+        let record = Record { evaluations: made.to_vec(), ..Record::default() };
+        assert_eq!(measured(&evaluations(&record)), (Some("mean_return"), vec![1.0, 2.0]));
     }
 
     #[test]

@@ -52,7 +52,7 @@ pub fn router() -> Router<Page> {
 #[derive(Debug, thiserror::Error)]
 pub enum ApiError {
     #[error(
-        "the request does not carry this run's token; `rit ctl --run DIR web` prints the address that does"
+        "the request does not carry the token: open the address with it that was printed (`rit ctl --run DIR web` prints a run's)"
     )]
     Unauthorized,
     #[error("{0}")]
