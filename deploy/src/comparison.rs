@@ -1,6 +1,6 @@
 //! `rit report`: the experimental section of a paper, from runs that are over.
 
-use crate::{cli::ReportOptions, failure::Failure, output, representations};
+use crate::{cli::ReportOptions, experiments::plain_settings, failure::Failure, output, representations};
 use rit_report::{Measure, Options, Report, ReportError, finished, read, report};
 use std::{
     fs, io,
@@ -26,6 +26,7 @@ pub fn run(options: &ReportOptions) -> Result<ExitCode, Failure> {
         pairs: options.pairs.clone(),
         replications: options.replications,
         seed: options.seed,
+        plain: plain_settings,
     };
     let (groups, unfinished) = finished(&input, &settings)?;
     let more = vec![representations::section(&groups, options.seed)?];

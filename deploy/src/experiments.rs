@@ -3,7 +3,7 @@
 use crate::{cli::ConfigOptions, failure::Failure, output, python_worlds};
 use rit_algo::Method;
 use rit_config::{Config, read_text, resolve, set};
-use std::{path::Path, process::ExitCode};
+use std::{collections::BTreeMap, path::Path, process::ExitCode};
 use toml::Table;
 
 /// Name and text of each, from `deploy/experiments/`.
@@ -97,6 +97,14 @@ fn with_worlds(text: &str, source_name: &str, mut settings: Vec<Table>) -> Resul
 /// When one is no assignment.
 pub fn parse_settings(settings: &[String]) -> Result<Vec<Table>, Failure> {
     Ok(settings.iter().map(|text| set(text)).collect::<Result<_, _>>()?)
+}
+
+/// Every setting of a run of the experiment that is called as its task set, with this method and nothing else set: what
+/// reports and plots call by the method's plain name. Other task sets have their presets.
+pub fn plain_settings(task_set: &str, method: &str) -> Option<BTreeMap<String, String>> {
+    let (name, text) = EXPERIMENTS.into_iter().find(|(name, _)| *name == task_set)?;
+    let method = set(&algorithm(Some(method))?).ok()?;
+    resolve(text, name, &[method]).ok()?.settings().ok()
 }
 
 fn unknown(experiment: &str) -> Failure {

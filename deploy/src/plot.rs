@@ -2,6 +2,7 @@
 
 use crate::{
     cli::{PlotMetric, PlotOptions},
+    experiments::plain_settings,
     failure::Failure,
     new_file, output,
 };
@@ -38,7 +39,7 @@ pub fn run(options: &PlotOptions) -> Result<ExitCode, Failure> {
     }
     let by = input.keys_by(&options.by);
     let measure = options.metric.map(Measure::from);
-    let groups = groups(input.runs, &Options { measure, by, ..Options::default() })?;
+    let groups = groups(input.runs, &Options { measure, by, plain: plain_settings, ..Options::default() })?;
     let styles = Styles::of(&groups);
     let charts: Vec<Chart> = if options.tasks {
         groups.iter().flat_map(|group| by_task(group, &styles)).collect()

@@ -1,7 +1,10 @@
 //! `rit serve`: a folder of runs or a sweep in a browser of this machine. Each request looks for what has changed, so a
 //! sweep that still runs fills up as one looks; runs whose files have not changed are not read again.
 
-use crate::{cli::ServeOptions, failure::Failure, output, player::Trained, render, shutdown};
+use crate::{
+    cli::ServeOptions, experiments::plain_settings, failure::Failure, output, player::Trained, render,
+    shutdown,
+};
 use axum::{
     Router,
     extract::{Path as UrlPath, Query, State},
@@ -19,7 +22,7 @@ use rit_learner::{
 };
 use rit_record::{Record, RecordError};
 use rit_report::{
-    CSS, Figure, Group, Input, Options, ReportError, Section, Styles, Table, chart,
+    CSS, Figure, Group, Input, Measure, Options, ReportError, Section, Styles, SweepState, Table, chart,
     figures::{self, Drawn},
     groups, page, read_by,
 };
@@ -180,10 +183,7 @@ async fn all(
     apart(move || {
         let input = shown.read()?;
         let mut runs = Section::new("runs", "Runs");
-        for sweep in &input.sweeps {
-            let all = sweep.finished + sweep.missing.len();
-            runs.text.push(format!("{} of {all} runs of the sweep are finished.", sweep.finished));
-        }
+        runs.text.extend(input.sweeps.iter().map(SweepState::words));
         let links = (0..input.runs.len()).map(|at| format!("{RUNS}/{at}")).collect();
         runs.tables.push(Table { links, ..table(&shown, &input.runs) });
         let curves = curves(&shown, input, measured.measure.as_deref())?;
@@ -196,8 +196,8 @@ async fn all(
 fn curves(shown: &Shown, input: Input, measure: Option<&str>) -> Result<Section, Wrong> {
     let mut section = Section::new("curves", "Learning curves");
     let measure = match measure {
-        Some("return") => Some(rit_report::Measure::Return),
-        Some("win_rate") => Some(rit_report::Measure::WinRate),
+        Some("return") => Some(Measure::Return),
+        Some("win_rate") => Some(Measure::WinRate),
         _ => None,
     };
     let by = input.keys_by(&shown.by);
@@ -213,7 +213,7 @@ fn curves(shown: &Shown, input: Input, measure: Option<&str>) -> Result<Section,
         sets.entry((task_set, interval)).or_default().push(run);
     }
     for runs in sets.into_values() {
-        let options = Options { measure, by: by.clone(), ..Options::default() };
+        let options = Options { measure, by: by.clone(), plain: plain_settings, ..Options::default() };
         set_curves(&mut section, &runs, options)?;
     }
     if has_wins {
@@ -240,9 +240,11 @@ fn set_curves(section: &mut Section, runs: &[Record], options: Options) -> Resul
                 section.figures.push(Figure {
                     id: group.id.clone(),
                     title: group.title.clone(),
-                    caption: "Mean over seeds and tasks, finished or not; bands: 95 % intervals, where there are 5 seeds or \
-                              more; thin lines: single runs."
-                        .to_owned(),
+                    caption: format!(
+                        "Mean over seeds and tasks, finished or not; bands: 95 % intervals, where there are 5 seeds or more; \
+                         thin lines: single runs.{}",
+                        Measure::ends("Bands", [group.measure])
+                    ),
                     svg: chart::curves(&[chart])?,
                 });
             }
@@ -367,8 +369,12 @@ fn by_task(run: Record) -> Result<Section, Wrong> {
             mean(Split::Training, "training tasks").into_iter().chain(mean(Split::Testing, "unseen tasks"));
         let charts: Vec<_> = means
             .chain(tasks.map(of_task))
-            .filter(|chart| chart.lines.iter().any(|it| !it.points.is_empty()))
+            .filter(|chart| chart.lines.iter().any(|it| it.points.len() > 1))
             .collect();
+        if charts.is_empty() {
+            section.text.push("It was evaluated once so far.".to_owned());
+            continue;
+        }
         section.figures.push(Figure {
             id: group.id.clone(),
             title: group.title.clone(),

@@ -19,9 +19,19 @@ const THRESHOLDS: usize = 101;
 /// Most points of a curve whose intervals are estimated.
 const POINTS_MAX: usize = 60;
 
-/// Below every table of aggregates whose intervals say little.
-const UNRELIABLE: &str =
-    "† fewer than 5 seeds: the interval is not reliable, and figures show the runs instead.";
+/// What stands below a table of methods with so many runs each, where some are few.
+fn few(runs: impl IntoIterator<Item = usize>) -> &'static str {
+    match runs.into_iter().min() {
+        Some(1) => {
+            " † fewer than 5 seeds: the interval is not reliable, and figures show the runs instead; a single run has no \
+             interval."
+        }
+        Some(runs) if runs < SEEDS_MIN => {
+            " † fewer than 5 seeds: the interval is not reliable, and figures show the runs instead."
+        }
+        _ => "",
+    }
+}
 
 /// Scores of methods on the same tasks, from 0 to 1.
 #[derive(Debug)]
@@ -70,7 +80,7 @@ pub fn scored(group: &Group, split: Split) -> Option<Scored> {
                                 run in this report had on the task, 1 the highest."
                     .to_owned()
             }
-            Measure::WinRate => "Scores are win rates.".to_owned(),
+            Measure::WinRate => "Win rates are scores as they are.".to_owned(),
         },
         methods: methods.map(|(method, scores)| (method.label.clone(), rows_of(&scale(scores)))).collect(),
         curve: curve
@@ -96,8 +106,8 @@ fn curve(group: &Group, split: Split) -> Vec<(u64, Vec<Scores>)> {
     common.filter_map(at).collect()
 }
 
-/// Scores over several groups at once, of the methods that are in all of them; none of fewer than two. Where a method has
-/// more seeds in one group than in another, the first ones count.
+/// Scores over several groups at once, of the methods that are in all of them; none of fewer than two groups or methods,
+/// which would compare nothing. Where a method has more seeds in one group than in another, the first ones count.
 pub fn joined(all: &[Scored]) -> Option<Scored> {
     let (first, rest) = all.split_first().filter(|(_, rest)| !rest.is_empty())?;
     let rows_in = |scored: &'_ Scored, label: &str| {
@@ -114,10 +124,16 @@ pub fn joined(all: &[Scored]) -> Option<Scored> {
     };
     let methods: Vec<_> = first.methods.iter().filter_map(method).collect();
     let kind = first.id.rsplit('-').next().unwrap_or_default();
-    (!methods.is_empty()).then(|| Scored {
+    let mut scales: Vec<&str> = Vec::new();
+    for scored in all {
+        if !scales.contains(&scored.scale.as_str()) {
+            scales.push(&scored.scale);
+        }
+    }
+    (methods.len() > 1).then(|| Scored {
         id: format!("all-{kind}"),
         title: format!("All {} task sets with these methods, {kind} tasks", all.len()),
-        scale: first.scale.clone(),
+        scale: scales.join(" "),
         methods,
         curve: Vec::new(),
     })
@@ -160,7 +176,7 @@ impl Scored {
             let found = statistics::aggregates(&scores, options.replications, &mut rng);
             let found = [found.iqm, found.median, found.mean, found.optimality_gap];
             let reliable = scores.runs() >= SEEDS_MIN;
-            let cells = found.iter().map(|estimate| cell(estimate, reliable));
+            let cells = found.iter().map(|estimate| cell(estimate, scores.runs()));
             let seeds = scores.runs().to_string();
             table.rows.push([label.clone()].into_iter().chain(cells).chain([seeds]).collect());
             let each: Vec<Scores> = runs_alone(&scores);
@@ -182,9 +198,7 @@ impl Scored {
                 });
             }
         }
-        if self.methods.iter().any(|(_, runs)| runs.len() < SEEDS_MIN) {
-            table.note += &format!(" {UNRELIABLE}");
-        }
+        table.note += few(self.methods.iter().map(|(_, runs)| runs.len()));
         let figure = Figure {
             id: table.id.clone(),
             title: table.title.clone(),
@@ -251,20 +265,19 @@ impl Scored {
             ),
             ..Table::default()
         };
-        let mut rows = Vec::new();
+        let (mut rows, mut fewest) = (Vec::new(), Vec::new());
         for (x, y) in pairs {
             let mut rng = self.rng(options, &format!("{} {}", x.0, y.0), 2);
             let found = statistics::improvement_estimate(&x.1, &y.1, CURVE_REPLICATIONS, &mut rng);
-            let reliable = x.1.runs().min(y.1.runs()) >= SEEDS_MIN;
-            table.rows.push(vec![x.0.clone(), y.0.clone(), cell(&found, reliable)]);
+            let runs = x.1.runs().min(y.1.runs());
+            table.rows.push(vec![x.0.clone(), y.0.clone(), cell(&found, runs)]);
             let mut key = styles.key(y.0);
             key.label = format!("{} > {}", x.0, y.0);
-            let interval = reliable.then_some((found.interval.low, found.interval.high));
+            let interval = (runs >= SEEDS_MIN).then_some((found.interval.low, found.interval.high));
+            fewest.push(runs);
             rows.push(Row { key, value: found.value, interval, runs: Vec::new() });
         }
-        if table.rows.iter().any(|row| row[2].ends_with('†')) {
-            table.note += &format!(" {UNRELIABLE}");
-        }
+        table.note += few(fewest);
         let chart = Rows { title: "P(X > Y)".to_owned(), rows, line: Some(0.5), shown: vec![0.0, 1.0] };
         let figure = Figure {
             id: table.id.clone(),
@@ -350,7 +363,47 @@ fn estimated(styles: &Styles, label: &str, points: &[(f64, Estimate)], runs: usi
     }
 }
 
-fn cell(Estimate { value, interval }: &Estimate, reliable: bool) -> String {
+/// A value and its interval; resampling a single run gives none.
+fn cell(Estimate { value, interval }: &Estimate, runs: usize) -> String {
     let [value, low, high] = [*value, interval.low, interval.high].map(|number| signed(number, 3));
-    format!("{value} [{low}, {high}]{}", if reliable { "" } else { "†" })
+    match runs {
+        1 => value,
+        runs if runs < SEEDS_MIN => format!("{value} [{low}, {high}]†"),
+        _ => format!("{value} [{low}, {high}]"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_single_run_has_no_interval_and_few_have_one_that_is_marked() {
+        let estimate = Estimate { value: 0.5, interval: rit_statistics::Interval { low: -0.25, high: 0.75 } };
+        let cells = [1, 4, 5].map(|runs| cell(&estimate, runs));
+        assert_eq!(cells, ["0.500", "0.500 [−0.250, 0.750]†", "0.500 [−0.250, 0.750]"]);
+        assert!(few([5, 1]).ends_with("a single run has no interval.") && few([5, 4]).contains('†'));
+        assert_eq!(few([5, 7]), "");
+    }
+
+    #[test]
+    fn scores_over_groups_are_of_methods_that_all_have_and_each_scale_is_said_once() {
+        let scored = |id: &str, scale: &str, methods: &[(&str, f64)]| Scored {
+            id: format!("{id}-training"),
+            title: String::new(),
+            scale: scale.to_owned(),
+            methods: methods.iter().map(|(name, score)| ((*name).to_owned(), vec![vec![*score]])).collect(),
+            curve: Vec::new(),
+        };
+        let wins = scored("a", "Wins.", &[("rit", 0.25), ("mat", 0.5), ("roma", 0.0)]);
+        let returns = scored("b", "Returns.", &[("rit", 0.75), ("mat", 1.0)]);
+        let more = scored("c", "Returns.", &[("mat", 0.0), ("rit", 0.5)]);
+        let joined = joined(&[wins, returns, more]).unwrap();
+        assert_eq!((joined.scale.as_str(), joined.id.as_str()), ("Wins. Returns.", "all-training"));
+        let expected = [("rit", [0.25, 0.75, 0.5]), ("mat", [0.5, 1.0, 0.0])];
+        let expected = expected.map(|(name, scores)| (name.to_owned(), vec![scores.to_vec()]));
+        assert_eq!(joined.methods, expected);
+        let alone = |id: &str| scored(id, "", &[("rit", 1.0)]);
+        assert!(super::joined(&[alone("a"), alone("b")]).is_none(), "one method is no comparison");
+    }
 }

@@ -1,6 +1,7 @@
 //! Charts as SVG: curves, intervals in rows, and points, several beside each other under one legend.
 
 mod plane;
+mod svg;
 
 use crate::ReportError;
 use plane::{Labels, padded, plane, span, text, ticks};
@@ -8,12 +9,13 @@ use plotters::{
     coord::{Shift, types::RangedCoordf64},
     prelude::{
         Cartesian2d, ChartBuilder, ChartContext, Circle, Color as _, DrawingArea, IntoDrawingArea as _,
-        LineSeries, PathElement, Polygon, RGBColor, SVGBackend, WHITE,
+        LineSeries, PathElement, Polygon, RGBColor, WHITE,
     },
     series::DashedLineSeries,
     style::text_anchor::{HPos, Pos, VPos},
 };
 use std::error::Error;
+use svg::{PIXEL, Svg};
 
 /// Width of a figure, in pixels.
 const WIDTH: u32 = 960;
@@ -22,6 +24,8 @@ const CHART_HEIGHT: u32 = 330;
 /// Height of a row of intervals, and of what is above and below them.
 const ROW_HEIGHT: u32 = 24;
 const ROWS_FRAME: u32 = 84;
+/// Length of the marks that numbers stand at.
+const TICK: u32 = 5;
 /// A line of the legend.
 const LEGEND_LINE: i32 = 22;
 
@@ -47,6 +51,12 @@ const COLOURS: [RGBColor; 16] = [
 ];
 const GREY: RGBColor = RGBColor(105, 105, 105);
 const FRAME: RGBColor = RGBColor(190, 190, 190);
+const GRID: RGBColor = RGBColor(232, 232, 232);
+
+/// Pixels in units of drawing.
+const fn px(pixels: u32) -> u32 {
+    pixels * PIXEL as u32
+}
 
 /// What a line, a row or points are called, and in which colour they are drawn.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -151,9 +161,9 @@ pub struct Scatter {
     pub places: Vec<[f64; 2]>,
 }
 
-type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
+type Area<'a> = DrawingArea<Svg<'a>, Shift>;
 type Drawn = Result<(), Box<dyn Error + Send + Sync>>;
-type Plane<'a> = ChartContext<'a, SVGBackend<'a>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
+type Plane<'a> = ChartContext<'a, Svg<'a>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 
 /// Charts of curves, two beside each other.
 ///
@@ -181,14 +191,14 @@ pub fn rows(charts: &[Rows]) -> Result<String, ReportError> {
     let longest = first.rows.iter().map(|row| row.key.label.chars().count()).max().unwrap_or(0);
     let labels = (longest as i32 * 8 + 18).clamp(60, 330);
     figure(&[], height, |area| {
-        let (left, right) = area.split_horizontally(labels);
+        let (left, right) = area.split_horizontally(labels * PIXEL);
         let mut heights = Vec::new();
         for (chart, part) in charts.iter().zip(right.split_evenly((1, charts.len()))) {
             heights = draw_rows(chart, &part)?;
         }
         for (row, y) in first.rows.iter().zip(heights) {
             let style = text(16).pos(Pos::new(HPos::Right, VPos::Center));
-            left.draw_text(&row.key.label, &style, (labels - 8, y))?;
+            left.draw_text(&row.key.label, &style, ((labels - 8) * PIXEL, y))?;
         }
         Ok(())
     })
@@ -205,14 +215,21 @@ pub fn map(title: &str, points: &[Points]) -> Result<String, ReportError> {
         let span = |axis: usize| padded(all().map(|place| place[axis]), 0.05);
         let (x, y) = (span(0), span(1));
         let mut chart = ChartBuilder::on(area)
-            .margin(14)
+            .margin(px(14))
             .caption(title, text(18))
             .build_cartesian_2d(x[0]..x[1], y[0]..y[1])?;
         // A map's axes mean nothing: it gets a frame and no numbers.
-        chart.configure_mesh().disable_mesh().x_labels(0).y_labels(0).axis_style(FRAME).draw()?;
+        chart
+            .configure_mesh()
+            .disable_mesh()
+            .x_labels(0)
+            .y_labels(0)
+            .axis_style(FRAME.stroke_width(px(1)))
+            .draw()?;
         for Points { key, places, hollow } in points {
-            let style = if *hollow { key.colour().stroke_width(2) } else { key.colour().mix(0.75).filled() };
-            chart.draw_series(places.iter().map(|&[x, y]| Circle::new((x, y), 4, style)))?;
+            let style =
+                if *hollow { key.colour().stroke_width(px(2)) } else { key.colour().mix(0.75).filled() };
+            chart.draw_series(places.iter().map(|&[x, y]| Circle::new((x, y), px(4), style)))?;
         }
         Ok(())
     })
@@ -241,16 +258,19 @@ fn figure(keys: &[Key], height: u32, draw: impl FnOnce(&Area) -> Drawn) -> Resul
     let legend_height = legend.last().map_or(0, |(_, y)| y + LEGEND_LINE);
     let mut svg = String::new();
     let drawn = (|| -> Drawn {
-        let area =
-            SVGBackend::with_string(&mut svg, (WIDTH, height + legend_height as u32)).into_drawing_area();
+        let area = Svg::new(&mut svg, (px(WIDTH), px(height + legend_height as u32))).into_drawing_area();
         area.fill(&WHITE)?;
         for (key, &(x, y)) in keys.iter().zip(&legend) {
-            let y = y + LEGEND_LINE / 2;
-            let dash = if key.is_dashed() { 10 } else { 20 };
-            area.draw(&PathElement::new([(x, y), (x + dash, y)], key.colour().stroke_width(3)))?;
-            area.draw_text(&key.label, &text(16).pos(Pos::new(HPos::Left, VPos::Center)), (x + 26, y))?;
+            let (x, y) = (x * PIXEL, (y + LEGEND_LINE / 2) * PIXEL);
+            let dashes = if key.is_dashed() { &[(0, 8), (13, 20)][..] } else { &[(0, 20)] };
+            for (from, to) in dashes {
+                let ends = [(x + from * PIXEL, y), (x + to * PIXEL, y)];
+                area.draw(&PathElement::new(ends, key.colour().stroke_width(px(3))))?;
+            }
+            let style = text(16).pos(Pos::new(HPos::Left, VPos::Center));
+            area.draw_text(&key.label, &style, (x + 26 * PIXEL, y))?;
         }
-        draw(&area.split_vertically(legend_height).1)?;
+        draw(&area.split_vertically(legend_height * PIXEL).1)?;
         Ok(area.present()?)
     })();
     drawn.map_err(|error| ReportError::Draw(error.to_string()))?;
@@ -300,7 +320,12 @@ fn draw_curves(chart: &Chart, area: &Area) -> Drawn {
         draw_line(line, &mut plane)?;
     }
     if let Some(y) = chart.marked {
-        plane.draw_series(DashedLineSeries::new([(left, y), (right, y)], 6, 4, GREY.stroke_width(1)))?;
+        plane.draw_series(DashedLineSeries::new(
+            [(left, y), (right, y)],
+            6 * PIXEL,
+            4 * PIXEL,
+            GREY.stroke_width(px(1)),
+        ))?;
     }
     Ok(())
 }
@@ -312,10 +337,15 @@ fn draw_scatter(scatter: &Scatter, area: &Area) -> Drawn {
     let mut plane = plane(area, &labels, [left, right], [bottom, top])?;
     let (from, to) = (left.max(bottom), right.min(top));
     if from < to {
-        plane.draw_series(DashedLineSeries::new([(from, from), (to, to)], 6, 4, GREY.stroke_width(1)))?;
+        plane.draw_series(DashedLineSeries::new(
+            [(from, from), (to, to)],
+            6 * PIXEL,
+            4 * PIXEL,
+            GREY.stroke_width(px(1)),
+        ))?;
     }
     let style = scatter.key.colour().mix(0.5).filled();
-    plane.draw_series(scatter.places.iter().map(|&[x, y]| Circle::new((x, y), 2, style)))?;
+    plane.draw_series(scatter.places.iter().map(|&[x, y]| Circle::new((x, y), px(2), style)))?;
     Ok(())
 }
 
@@ -328,17 +358,17 @@ fn draw_line(line: &Line, plane: &mut Plane) -> Drawn {
         plane.draw_series(std::iter::once(Polygon::new(outline, colour.mix(0.15))))?;
     }
     for run in &line.runs {
-        plane.draw_series(LineSeries::new(run.iter().copied(), colour.mix(0.35).stroke_width(1)))?;
+        plane.draw_series(LineSeries::new(run.iter().copied(), colour.mix(0.35).stroke_width(px(1))))?;
     }
     let points = line.points.iter().copied();
     if line.key.is_dashed() {
-        plane.draw_series(DashedLineSeries::new(points, 8, 5, colour.stroke_width(2)))?;
+        plane.draw_series(DashedLineSeries::new(points, 8 * PIXEL, 5 * PIXEL, colour.stroke_width(px(2))))?;
     } else {
-        plane.draw_series(LineSeries::new(points, colour.stroke_width(2)))?;
+        plane.draw_series(LineSeries::new(points, colour.stroke_width(px(2))))?;
     }
     // Few points are shown as such: between them nothing was measured.
     if line.points.len() <= 12 {
-        plane.draw_series(line.points.iter().map(|&point| Circle::new(point, 3, colour.filled())))?;
+        plane.draw_series(line.points.iter().map(|&point| Circle::new(point, px(3), colour.filled())))?;
     }
     Ok(())
 }
@@ -353,19 +383,20 @@ fn draw_rows(chart: &Rows, area: &Area) -> Result<Vec<i32>, Box<dyn Error + Send
     let [left, right] = padded(all, 0.06);
     let count = chart.rows.len() as f64;
     let mut plane = ChartBuilder::on(area)
-        .margin_left(14)
-        .margin_right(16)
-        .margin_top(8)
-        .margin_bottom(4)
+        .margin_left(px(14))
+        .margin_right(px(16))
+        .margin_top(px(8))
+        .margin_bottom(px(4))
         .caption(&chart.title, text(17))
-        .x_label_area_size(34)
+        .x_label_area_size(px(34))
         .build_cartesian_2d(left..right, 0.0..count)?;
     let tick = ticks(left, right);
     plane
         .configure_mesh()
-        .light_line_style(WHITE)
-        .bold_line_style(RGBColor(232, 232, 232))
-        .axis_style(FRAME)
+        .max_light_lines(0)
+        .set_all_tick_mark_size(px(TICK))
+        .bold_line_style(GRID.stroke_width(px(1)))
+        .axis_style(FRAME.stroke_width(px(1)))
         .disable_y_mesh()
         .x_labels(4)
         .y_labels(0)
@@ -373,7 +404,12 @@ fn draw_rows(chart: &Rows, area: &Area) -> Result<Vec<i32>, Box<dyn Error + Send
         .label_style(text(15))
         .draw()?;
     if let Some(line) = chart.line {
-        plane.draw_series(DashedLineSeries::new([(line, 0.0), (line, count)], 5, 4, GREY.stroke_width(1)))?;
+        plane.draw_series(DashedLineSeries::new(
+            [(line, 0.0), (line, count)],
+            5 * PIXEL,
+            4 * PIXEL,
+            GREY.stroke_width(px(1)),
+        ))?;
     }
     for (at, row) in chart.rows.iter().enumerate() {
         let (y, colour) = (count - at as f64 - 0.5, row.key.colour());
@@ -381,10 +417,12 @@ fn draw_rows(chart: &Rows, area: &Area) -> Result<Vec<i32>, Box<dyn Error + Send
             let bar = [(low, y - 0.3), (high, y - 0.3), (high, y + 0.3), (low, y + 0.3)];
             plane.draw_series(std::iter::once(Polygon::new(bar.to_vec(), colour.mix(0.45))))?;
         }
-        plane.draw_series(row.runs.iter().map(|&run| Circle::new((run, y), 3, colour.mix(0.5).filled())))?;
+        plane.draw_series(
+            row.runs.iter().map(|&run| Circle::new((run, y), px(3), colour.mix(0.5).filled())),
+        )?;
         if row.value.is_finite() {
             let stroke = [(row.value, y - 0.36), (row.value, y + 0.36)];
-            plane.draw_series(LineSeries::new(stroke, colour.stroke_width(3)))?;
+            plane.draw_series(LineSeries::new(stroke, colour.stroke_width(px(3))))?;
         }
     }
     let height = |at: usize| plane.backend_coord(&(left, count - at as f64 - 0.5)).1;

@@ -29,11 +29,22 @@ pub struct Options {
     pub replications: usize,
     /// Of the bootstrap and of maps.
     pub seed: u64,
+    /// What a method's plain name means on a task set: every setting of a run for which nothing else is set.
+    pub plain: fn(&str, &str) -> Option<Settings>,
+}
+
+/// Every `section.key` with its value.
+pub type Settings = BTreeMap<String, String>;
+
+/// What the presets say of a task set and a method: the paper's tables, as far as it has them.
+pub(crate) fn of_presets(task_set: &str, method: &str) -> Option<Settings> {
+    preset_settings(task_set, method).ok()
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { measure: None, by: Vec::new(), pairs: Vec::new(), replications: 50_000, seed: 1 }
+        let (measure, by, pairs) = (None, Vec::new(), Vec::new());
+        Self { measure, by, pairs, replications: 50_000, seed: 1, plain: of_presets }
     }
 }
 
@@ -66,6 +77,11 @@ pub struct Method {
 }
 
 impl Method {
+    /// Whether something else was set than what its plain name means: the label says what, after a space.
+    pub fn is_variant(&self) -> bool {
+        self.label.contains(' ')
+    }
+
     /// Whether there are seeds enough for an interval.
     pub fn is_reliable(&self) -> bool {
         self.runs.len() >= rit_statistics::SEEDS_MIN
@@ -150,6 +166,7 @@ fn group(
     options: &Options,
 ) -> Result<Group, ReportError> {
     let measure = options.measure.unwrap_or_else(|| Measure::of_task_set(&task_set));
+    refuse_other_versions(&runs)?;
     let methods = methods(&task_set, runs, options)?;
     refuse_other_intervals(&methods)?;
     let mut title = paper::title(&task_set);
@@ -178,7 +195,7 @@ fn group(
 fn methods(task_set: &str, runs: Vec<Record>, options: &Options) -> Result<Vec<Method>, ReportError> {
     let mut methods: Vec<Method> = Vec::new();
     for run in runs {
-        let label = label(&run, task_set, &options.by);
+        let label = label(&run, task_set, options);
         let Some(method) = methods.iter_mut().find(|method| method.label == label) else {
             methods.push(Method { label, runs: vec![run] });
             continue;
@@ -199,19 +216,19 @@ fn value<'a>(run: &'a Record, key: &str) -> Option<&'a String> {
 }
 
 /// The method's name, and what sets it apart from others of that name.
-fn label(run: &Record, task_set: &str, by: &[String]) -> String {
+fn label(run: &Record, task_set: &str, options: &Options) -> String {
     let mut label = run.method().map_or_else(|| older(run, task_set), str::to_owned);
     if run.settings.get(PERMUTATION).is_some_and(|value| value == "false") && is_permuted(&label) {
         label += NO_PERMUTATION;
     }
-    let preset = preset_settings(task_set, run.method().unwrap_or("rit")).unwrap_or_default();
-    for key in by {
+    let plain = (options.plain)(task_set, run.method().unwrap_or("rit")).unwrap_or_default();
+    for key in &options.by {
         let word = key.rsplit('.').next().unwrap_or(key);
         match value(run, key) {
             // It is the label already, or its values are in the label.
             Some(value) if *value == label => {}
             // Runs that change nothing are what the method's plain name means.
-            Some(value) if preset.get(key) == Some(value) => {}
+            Some(value) if plain.get(key) == Some(value) => {}
             _ if ["algorithm.name", PERMUTATION].contains(&key.as_str()) => {}
             Some(value) if word == "folder" => label += &format!(" {value}"),
             Some(value) => label += &format!(" {word}={value}"),
@@ -254,19 +271,26 @@ fn refuse_same(first: &Record, second: &Record) -> Result<(), ReportError> {
     Err(ReportError::Twice { first, second, seed })
 }
 
+/// Between versions anything may have changed, of one method as of several.
+fn refuse_other_versions(runs: &[Record]) -> Result<(), ReportError> {
+    let mut known = runs.iter().filter_map(|run| Some((run, &run.build.as_ref()?.version)));
+    let Some((first, version)) = known.next() else { return Ok(()) };
+    match known.find(|(_, other)| *other != version) {
+        None => Ok(()),
+        Some((second, other)) => Err(ReportError::Versions {
+            first: first.name.clone(),
+            second: second.name.clone(),
+            versions: (version.clone(), other.clone()),
+        }),
+    }
+}
+
 fn refuse_other_kind(
     first: &Record,
     second: &Record,
     method: &str,
     task_set: &str,
 ) -> Result<(), ReportError> {
-    let version = |run: &Record| run.build.as_ref().map(|build| build.version.clone());
-    if let (Some(a), Some(b)) = (version(first), version(second))
-        && a != b
-    {
-        let (first, second) = (first.name.clone(), second.name.clone());
-        return Err(ReportError::Versions { first, second, versions: (a, b) });
-    }
     if first.kind == second.kind {
         return Ok(());
     }

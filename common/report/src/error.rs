@@ -49,7 +49,7 @@ pub enum ReportError {
     Versions {
         /// A run.
         first: String,
-        /// A run of the same method.
+        /// Another on the same tasks.
         second: String,
         /// Their versions.
         versions: (String, String),

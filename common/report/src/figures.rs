@@ -43,7 +43,8 @@ impl Drawn {
         }
     }
 
-    fn caption(self) -> String {
+    /// `measures` are those of the charts below which it stands.
+    fn caption(self, measures: impl IntoIterator<Item = Measure>) -> String {
         let (line, band) = match self {
             Self::MeanAndInterval => ("mean", "95 % intervals of Student's t over seeds"),
             Self::MeanAndDeviation => {
@@ -55,7 +56,8 @@ impl Drawn {
         };
         format!(
             "Lines: {line} over seeds of the mean over tasks, greedy episodes. Bands: {band}; thin lines: single runs, where \
-             there are fewer than 5 seeds."
+             there are fewer than 5 seeds.{}",
+            Measure::ends("Bands", measures)
         )
     }
 }
@@ -85,19 +87,33 @@ pub fn learning_curves(groups: &[Group], styles: &Styles) -> Result<Vec<Figure>,
         figures.push(Figure {
             id: format!("figure-{}", figure.number),
             title: format!("Figure {} of the paper: {}", figure.number, figure.title),
-            caption: format!("{}{missing}", figure.drawn.caption()),
+            caption: format!(
+                "{}{missing}",
+                figure.drawn.caption(shown.iter().map(|(group, _)| group.measure))
+            ),
             svg: chart::curves(&charts)?,
         });
     }
     let covered = |group: &Group| {
         FIGURES.iter().any(|figure| shown(figure, groups).iter().any(|(it, _)| it.id == group.id))
     };
-    for group in groups.iter().filter(|group| !covered(group)) {
-        let methods: Vec<&Method> = group.methods.iter().collect();
+    for group in groups {
+        let (id, title, methods) = if covered(group) {
+            (
+                format!("curves-{}-other-settings", group.id),
+                "Learning curves with other settings",
+                variants(group),
+            )
+        } else {
+            (format!("curves-{}", group.id), "Learning curves", group.methods.iter().collect())
+        };
+        if methods.is_empty() {
+            continue;
+        }
         figures.push(Figure {
-            id: format!("curves-{}", group.id),
-            title: format!("Learning curves: {}", group.title),
-            caption: Drawn::MeanAndInterval.caption(),
+            id,
+            title: format!("{title}: {}", group.title),
+            caption: Drawn::MeanAndInterval.caption([group.measure]),
             svg: chart::curves(&[chart(group, &methods, Split::Training, Drawn::MeanAndInterval, styles)])?,
         });
     }
@@ -117,7 +133,8 @@ fn shown<'a>(figure: &PaperFigure, groups: &'a [Group]) -> Vec<(&'a Group, Vec<&
         .map(|group| {
             let named = |method: &&Method| figure.methods.contains(&method.label.as_str());
             let all = figure.methods.is_empty();
-            (group, group.methods.iter().filter(|method| all || named(method)).collect::<Vec<_>>())
+            let methods = if all { plain(group) } else { group.methods.iter().filter(named).collect() };
+            (group, methods)
         })
         .filter(|(_, methods)| methods.len() >= if figure.methods.is_empty() { 1 } else { 2 })
         .collect();
@@ -125,26 +142,42 @@ fn shown<'a>(figure: &PaperFigure, groups: &'a [Group]) -> Vec<(&'a Group, Vec<&
     shown
 }
 
+/// Methods with the settings that come with the task set; all where there are none such.
+fn plain(group: &Group) -> Vec<&Method> {
+    let plain: Vec<&Method> = group.methods.iter().filter(|method| !method.is_variant()).collect();
+    if plain.is_empty() { group.methods.iter().collect() } else { plain }
+}
+
+/// Methods with other settings, which would crowd the paper's figures, beside the first of the others.
+fn variants(group: &Group) -> Vec<&Method> {
+    let (variants, plain): (Vec<&Method>, Vec<&Method>) =
+        group.methods.iter().partition(|method| method.is_variant());
+    match plain.first() {
+        Some(first) if !variants.is_empty() => [&[*first][..], &variants].concat(),
+        _ => Vec::new(),
+    }
+}
+
 /// Curves on tasks that were never trained on, where they were evaluated on schedule.
 ///
 /// # Errors
 /// When it cannot be drawn.
 pub fn zero_shot_curves(groups: &[Group], styles: &Styles) -> Result<Option<Figure>, ReportError> {
-    let charts: Vec<Chart> = groups
+    let (measures, charts): (Vec<Measure>, Vec<Chart>) = groups
         .iter()
         .map(|group| {
             let methods: Vec<_> = group.methods.iter().collect();
-            chart(group, &methods, Split::Testing, Drawn::MeanAndInterval, styles)
+            (group.measure, chart(group, &methods, Split::Testing, Drawn::MeanAndInterval, styles))
         })
-        .filter(|chart| chart.lines.iter().any(|line| line.points.len() > 1))
-        .collect();
+        .filter(|(_, chart)| chart.lines.iter().any(|line| line.points.len() > 1))
+        .unzip();
     if charts.is_empty() {
         return Ok(None);
     }
     Ok(Some(Figure {
         id: "zero-shot-curves".to_owned(),
         title: "Zero-shot curves: tasks that were never trained on".to_owned(),
-        caption: Drawn::MeanAndInterval.caption(),
+        caption: Drawn::MeanAndInterval.caption(measures),
         svg: chart::curves(&charts)?,
     }))
 }
@@ -154,17 +187,20 @@ pub fn zero_shot_curves(groups: &[Group], styles: &Styles) -> Result<Option<Figu
 /// # Errors
 /// When it cannot be drawn.
 pub fn team_sizes(groups: &[Group], styles: &Styles) -> Result<Option<Figure>, ReportError> {
-    let charts: Vec<Chart> = groups.iter().filter_map(|group| team_size_chart(group, styles)).collect();
+    let of_group = |group: &Group| Some((group.measure, team_size_chart(group, styles)?));
+    let (measures, charts): (Vec<Measure>, Vec<Chart>) = groups.iter().filter_map(of_group).unzip();
     if charts.is_empty() {
         return Ok(None);
     }
     Ok(Some(Figure {
         id: "team-size".to_owned(),
         title: "What methods come to by the number of agents".to_owned(),
-        caption: "Tasks with as many agents count the same, seen or not. Bands: 95 % intervals of Student's t over \
-                  seeds; thin lines: single runs, where there are fewer than 5 seeds. Returns of other team sizes are \
-                  sums over other numbers of agents and landmarks: slopes are to be compared, not heights."
-            .to_owned(),
+        caption: format!(
+            "Tasks with as many agents count the same, seen or not. Bands: 95 % intervals of Student's t over seeds; thin \
+             lines: single runs, where there are fewer than 5 seeds.{} Returns of other team sizes are sums over other \
+             numbers of agents and landmarks: slopes are to be compared, not heights.",
+            Measure::ends("Bands", measures)
+        ),
         svg: chart::curves(&charts)?,
     }))
 }
@@ -193,7 +229,8 @@ fn team_size_chart(group: &Group, styles: &Styles) -> Option<Chart> {
             };
             (*size as f64, method.runs.iter().map(of_run).collect())
         };
-        line(method, &sizes.iter().map(of_size).collect::<Vec<_>>(), Drawn::MeanAndInterval, styles)
+        let points = sizes.iter().map(of_size).collect::<Vec<_>>();
+        line(method, &points, Drawn::MeanAndInterval, group.measure, styles)
     };
     let seen = |size: &&usize| sizes[size].iter().any(|(split, _)| *split == Split::Training);
     let seen: Vec<String> = sizes.keys().filter(seen).map(ToString::to_string).collect();
@@ -212,7 +249,7 @@ pub fn chart(group: &Group, methods: &[&Method], split: Split, drawn: Drawn, sty
     let of_method = |method: &&Method| {
         let curve = group.curve(method, split);
         let points: Vec<_> = curve.into_iter().map(|(step, values)| (step as f64, values)).collect();
-        line(method, &points, drawn, styles)
+        line(method, &points, drawn, group.measure, styles)
     };
     let over = match group.tasks(split).len() {
         1 => String::new(),
@@ -222,19 +259,24 @@ pub fn chart(group: &Group, methods: &[&Method], split: Split, drawn: Drawn, sty
         title: group.title.clone(),
         x: "environment steps".to_owned(),
         y: format!("{}{over}", group.measure.words()),
-        y_shown: match group.measure {
-            Measure::Return => Vec::new(),
-            Measure::WinRate => vec![0.0, 1.0],
-        },
+        y_shown: group.measure.range().map_or_else(Vec::new, |range| range.to_vec()),
         lines: methods.iter().map(of_method).collect(),
         ..Chart::default()
     }
 }
 
 /// A line of several runs, with its band or, where there are too few for one, the runs themselves.
-pub fn line(method: &Method, points: &[(f64, Vec<f64>)], drawn: Drawn, styles: &Styles) -> Line {
+fn line(
+    method: &Method,
+    points: &[(f64, Vec<f64>)],
+    drawn: Drawn,
+    measure: Measure,
+    styles: &Styles,
+) -> Line {
     let reliable = method.is_reliable();
-    let ends = |(x, values): &(f64, Vec<f64>)| drawn.band(values).map(|it| (*x, it.low, it.high));
+    let ends = |(x, values): &(f64, Vec<f64>)| {
+        drawn.band(values).map(|it| measure.possible(it)).map(|it| (*x, it.low, it.high))
+    };
     let run = |at: usize| points.iter().map(move |(x, values)| (*x, values[at])).collect();
     Line {
         key: styles.key(&method.label),
@@ -262,7 +304,25 @@ mod tests {
         assert_eq!(drawn(Drawn::MeanAndDeviation), [3.0, 0.354, 5.646]);
         assert_eq!(drawn(Drawn::MedianAndError), [2.0, 0.472, 3.528]);
         assert_eq!(drawn(Drawn::MeanAndInterval), [3.0, -3.572, 9.572]);
-        assert!(Drawn::MedianAndError.caption().starts_with("Lines: median over seeds"));
+        assert!(Drawn::MedianAndError.caption([]).starts_with("Lines: median over seeds"));
         assert!(Drawn::MeanAndDeviation.band(&[1.0]).is_none());
+    }
+
+    /// Five win rates, mean 0.9, deviation √(0.2/4) = 0.2236, error 0.1, t(4) = 2.7764: 0.9 ± 0.2776.
+    #[test]
+    fn no_band_of_win_rates_reaches_beyond_what_a_win_rate_can_be() {
+        let values = [1.0, 1.0, 1.0, 1.0, 0.5];
+        let method = Method { label: "a".to_owned(), runs: vec![rit_record::Record::default(); 5] };
+        let band = |drawn, measure| {
+            let line = line(&method, &[(7.0, values.to_vec())], drawn, measure, &Styles::default());
+            let (x, low, high) = line.band[0];
+            [x, low, high].map(|it| (it * 1000.0).round() / 1000.0)
+        };
+        assert_eq!(band(Drawn::MeanAndInterval, Measure::Return), [7.0, 0.622, 1.178]);
+        assert_eq!(band(Drawn::MeanAndInterval, Measure::WinRate), [7.0, 0.622, 1.0]);
+        assert_eq!(band(Drawn::MeanAndDeviation, Measure::WinRate), [7.0, 0.676, 1.0]);
+        let caption = Drawn::MeanAndInterval.caption([Measure::Return, Measure::WinRate]);
+        assert!(caption.ends_with("Bands of win rates end at 0 and 1, beyond which no win rate lies."));
+        assert!(!Drawn::MeanAndInterval.caption([Measure::Return]).contains("win rate"));
     }
 }

@@ -18,7 +18,7 @@ mod setup;
 mod shapley;
 mod table;
 
-pub use comparison::{Group, Method, Options, groups};
+pub use comparison::{Group, Method, Options, Settings, groups};
 pub use error::ReportError;
 pub use measure::{Measure, signed};
 pub use page::{CSS, Section, page};
@@ -26,7 +26,7 @@ pub use shapley::figure as shapley_figure;
 pub use table::Table;
 
 use rit_env::Split;
-use rit_record::{CellState, Record, RecordError, Sweep};
+use rit_record::{Cell, CellState, Record, RecordError, Sweep};
 use std::{
     collections::BTreeMap,
     path::{Path, PathBuf},
@@ -109,7 +109,24 @@ pub struct SweepState {
     /// Cells that are done.
     pub finished: usize,
     /// Names of the others, and how each stands.
-    pub missing: Vec<(String, &'static str)>,
+    pub missing: Vec<(String, String)>,
+}
+
+impl SweepState {
+    /// How far it has come, for people.
+    pub fn words(&self) -> String {
+        let all = self.finished + self.missing.len();
+        if self.missing.is_empty() {
+            return format!("Sweep {}: all {all} runs are finished.", self.name);
+        }
+        let names = self.missing.iter().map(|(name, state)| format!("{name} ({state})"));
+        format!(
+            "Sweep {}: {} of {all} runs are missing: {}.",
+            self.name,
+            self.missing.len(),
+            shortened(names.collect())
+        )
+    }
 }
 
 /// Finds and reads the runs.
@@ -145,19 +162,21 @@ pub fn read_by(
 }
 
 fn state(dir: &Path, sweep: &Sweep) -> SweepState {
-    let states: Vec<_> = sweep.cells.iter().map(|cell| (cell, Sweep::state(dir, cell))).collect();
-    let words = |state: CellState| match state {
-        CellState::Waiting => Some("has not begun"),
-        CellState::Begun => Some("runs, or was killed"),
+    let words = |cell: &Cell| match Sweep::state(dir, cell) {
+        CellState::Waiting => Some(match Sweep::failure(dir, cell) {
+            Some(why) => format!("failed: {why}"),
+            None => "has not begun".to_owned(),
+        }),
+        CellState::Begun => Some("runs, or was killed".to_owned()),
         CellState::Ended(ended) if ended.is_whole() => None,
-        CellState::Ended(_) => Some("ended early"),
+        CellState::Ended(ended) => Some(ended.to_string()),
     };
     let missing: Vec<_> =
-        states.iter().filter_map(|(cell, state)| Some((cell.name.clone(), words(*state)?))).collect();
+        sweep.cells.iter().filter_map(|cell| Some((cell.name.clone(), words(cell)?))).collect();
     SweepState {
         name: dir.display().to_string(),
         axes: sweep.axes.clone(),
-        finished: states.len() - missing.len(),
+        finished: sweep.cells.len() - missing.len(),
         missing,
     }
 }
@@ -206,12 +225,17 @@ pub fn report(
     more: Vec<Section>,
 ) -> Result<Report, ReportError> {
     let styles = Styles::of(groups);
-    let mut sections = vec![standing(input, groups, unfinished)];
+    let mut standing = standing(input, groups, unfinished);
+    let said = standing.text.clone();
+    let about = |group: &Group| Some(format!("{}: {}", group.title, paper::about(&group.task_set)?));
+    standing.text.extend(groups.iter().filter_map(about));
+    standing.tables.push(setup::methods(groups));
+    let mut sections = vec![standing];
     let mut curves = Section::new("curves", "Learning curves");
     curves.figures = figures::learning_curves(groups, &styles)?;
     sections.push(curves);
     let mut zero_shot = Section::new("results", "Results");
-    zero_shot.tables = results::of_the_paper(groups);
+    zero_shot.tables = results::of_the_paper(groups, options);
     zero_shot.tables.extend(groups.iter().map(results::by_task));
     sections.push(zero_shot);
     sections.push(over_tasks(groups, options, &styles)?);
@@ -221,16 +245,16 @@ pub fn report(
     unseen.tables.extend(results::gaps(groups));
     sections.push(unseen);
     let mut variation = Section::new("variation", "Variation between runs");
-    variation.tables.push(results::variation(groups));
+    variation.tables.extend(results::variation(groups));
     sections.push(variation);
     sections.push(shapley::section(groups)?);
     sections.extend(more);
     let mut setup = Section::new("setup", "Everything that is not the algorithm");
-    setup.tables = vec![setup::protocol(groups), setup::runs(groups)];
+    setup.tables = vec![setup::protocol(groups)];
+    setup.tables.extend(setup::runs(groups));
     setup.tables.extend(setup::settings(groups));
     sections.push(setup);
     sections.retain(|section| !section.is_empty());
-    let said = sections[0].text.clone();
     files(groups, &sections, said)
 }
 
@@ -257,40 +281,32 @@ fn files(groups: &[Group], sections: &[Section], said: Vec<String>) -> Result<Re
 fn standing(input: &Input, groups: &[Group], unfinished: &[Record]) -> Section {
     let mut section = Section::new("standing", "What was run");
     let runs = || groups.iter().flat_map(|group| group.methods.iter().map(|method| method.runs.len()));
-    let (finished, methods) = (runs().sum::<usize>(), runs().count());
+    let (finished, cells) = (runs().sum::<usize>(), runs().count());
+    let labels = groups.iter().flat_map(|group| group.methods.iter().map(|method| &method.label));
+    let methods = labels.collect::<std::collections::BTreeSet<_>>().len();
     let (fewest, most) = (runs().min().unwrap_or(0), runs().max().unwrap_or(0));
     let seeds = if fewest == most { counted(most, "seed") } else { format!("{fewest} to {most} seeds") };
     section.text.push(format!(
-        "{}: {} on {}{}, {seeds} each.",
+        "{}: {} on {}, {seeds} each.",
         counted(finished, "finished run"),
         counted(methods, "method"),
-        counted(groups.len(), "task set"),
-        if groups.len() == 1 { "" } else { ", counted on each" }
+        counted(groups.len(), "task set")
     ));
-    for sweep in &input.sweeps {
-        let all = sweep.finished + sweep.missing.len();
-        if sweep.missing.is_empty() {
-            section.text.push(format!("Sweep {}: all {all} runs are finished.", sweep.name));
-            continue;
-        }
-        let names = sweep.missing.iter().map(|(name, state)| format!("{name} ({state})"));
-        section.text.push(format!(
-            "Sweep {}: {} of {all} runs are missing: {}.",
-            sweep.name,
-            sweep.missing.len(),
-            shortened(names.collect())
-        ));
-    }
-    if !unfinished.is_empty() && input.sweeps.is_empty() {
-        let names = unfinished.iter().map(|run| run.name.clone()).collect();
-        section.text.push(format!("Not finished, and left out: {}.", shortened(names)));
+    section.text.extend(input.sweeps.iter().map(SweepState::words));
+    // Those of sweeps have been named.
+    let of_a_sweep =
+        |run: &Record| input.sweeps.iter().any(|sweep| Path::new(&run.name).starts_with(&sweep.name));
+    let others: Vec<String> =
+        unfinished.iter().filter(|run| !of_a_sweep(run)).map(|run| run.name.clone()).collect();
+    if !others.is_empty() {
+        section.text.push(format!("Not finished, and left out: {}.", shortened(others)));
     }
     let few = groups.iter().flat_map(|group| &group.methods).filter(|method| !method.is_reliable()).count();
     if few > 0 {
         section.text.push(format!(
-            "{few} of {} {} fewer than 5 seeds: the intervals are not reliable. Figures draw the runs instead, and tables \
-             mark them with †.",
-            counted(methods, "method"),
+            "{few} of {} (a method on a task set) {} fewer than 5 seeds: the intervals are not reliable. Figures draw the \
+             runs instead, and tables mark them with †.",
+            counted(cells, "cell"),
             if few == 1 { "has" } else { "have" }
         ));
     }
@@ -305,16 +321,18 @@ fn standing(input: &Input, groups: &[Group], unfinished: &[Record]) -> Section {
 /// Methods of a group that were not treated alike.
 fn uneven(group: &Group) -> Option<String> {
     let seeds = |method: &Method| method.runs.len();
+    // A record may not say it.
     let steps = |method: &Method| method.runs[0].settings.get("training.t_max").cloned();
+    let all_steps: std::collections::BTreeSet<String> = group.methods.iter().filter_map(steps).collect();
     let first = group.methods.first()?;
     let mut words = Vec::new();
     if group.methods.iter().any(|method| seeds(method) != seeds(first)) {
         words.push(format!(
-            "methods have different numbers of seeds, of which marl-eval.json holds the first {}",
+            "methods have different numbers of seeds; marl-eval.json, which wants as many of each, has the first {}",
             group.seeds_min()
         ));
     }
-    if group.methods.iter().any(|method| steps(method) != steps(first)) {
+    if all_steps.len() > 1 {
         words.push("methods were trained for different numbers of environment steps".to_owned());
     }
     (!words.is_empty()).then(|| format!("{}: {}.", group.title, words.join("; ")))
@@ -352,9 +370,11 @@ fn over_tasks(groups: &[Group], options: &Options, styles: &Styles) -> Result<Se
     }
     if !section.is_empty() {
         section.text.push(
-            "Definitions are those of rliable (Agarwal et al., 2021) and marl-eval (Gorsane et al., 2022). A run learns \
-             all tasks of a set at once, so its scores on them hang together; the bootstrap resamples runs within each \
-             task as if they did not."
+            "A score is what one run comes to on one task, on a scale from 0 to 1. IQM, the interquartile mean: the mean of \
+             the middle half of all scores. Median: of the tasks' means. Optimality gap: how far scores fall short of 1 on \
+             average. Definitions are those of rliable (Agarwal et al., 2021) and marl-eval (Gorsane et al., 2022). A run \
+             learns all tasks of a set at once, so its scores on them hang together; the bootstrap resamples runs within \
+             each task as if they did not."
                 .to_owned(),
         );
     }

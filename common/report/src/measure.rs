@@ -2,6 +2,7 @@
 
 use rit_env::{Split, TaskSet};
 use rit_record::{Occasion, Record, TaskResult};
+use rit_statistics::Interval;
 use std::collections::BTreeMap;
 
 /// What of an evaluation is compared.
@@ -35,6 +36,21 @@ impl Measure {
         match self {
             Self::Return => None,
             Self::WinRate => Some([0.0, 1.0]),
+        }
+    }
+
+    /// What of an interval of its mean can be.
+    pub fn possible(self, interval: Interval) -> Interval {
+        self.range().map_or(interval, |range| interval.within(range))
+    }
+
+    /// What a caption says of intervals or bands, by their name, of which some are of these measures: nothing, or where they
+    /// end.
+    pub fn ends(what: &str, measures: impl IntoIterator<Item = Self>) -> String {
+        if measures.into_iter().any(|measure| measure.range().is_some()) {
+            format!(" {what} of win rates end at 0 and 1, beyond which no win rate lies.")
+        } else {
+            String::new()
         }
     }
 

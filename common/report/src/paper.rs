@@ -255,6 +255,35 @@ pub fn title(task_set: &str) -> String {
     .to_owned()
 }
 
+/// What a task set is about, in a sentence; none of those that are no part of the paper's comparison.
+pub fn about(task_set: &str) -> Option<&'static str> {
+    Some(match task_set {
+        "matrix-game" => {
+            "Two agents play one of four games that look alike; only the first reward tells which it is."
+        }
+        NAVIGATION => {
+            "Agents are to be where landmarks are without bumping into each other; navigation-3-3 has three agents and three \
+             landmarks."
+        }
+        "predator-prey" => {
+            "Predators are to touch faster prey, which flee; predator-prey-3-2 has three predators and two prey."
+        }
+        "predator-prey-pro" => {
+            "As predator and prey, but two predators must touch the same prey at once, and distances to prey cost at every step."
+        }
+        set if is_combat(set) => {
+            "Battles of SMAC's kind between equal armies, played in a simulator and not in StarCraft II unless the runs' \
+             settings say so: win rates are not comparable with those of the game itself, which the paper has."
+        }
+        _ => return None,
+    })
+}
+
+/// Whether the paper played it in StarCraft II.
+pub fn is_combat(task_set: &str) -> bool {
+    FIGURES[1].task_sets.contains(&task_set)
+}
+
 /// A task set's place among all of them; others come last.
 pub fn place(task_set: &str) -> usize {
     TaskSet::ALL.iter().position(|set| set.to_string() == task_set).unwrap_or(TaskSet::ALL.len())

@@ -1,23 +1,24 @@
 //! Tables of results: the paper's III to V with ours beside them, task by task, the gap to unseen tasks, and how runs vary.
 
 use crate::{
-    comparison::{Group, Method},
+    comparison::{Group, Method, Options, Settings, of_presets},
     measure::{Measure, signed},
     paper::{self, PaperTable, TABLES},
     table::Table,
 };
 use rit_env::Split;
+use rit_record::Record;
 use rit_statistics::{generalisation_gap, mean, percentile, standard_error, t_interval};
 
 /// The percentiles that say how runs vary.
 const PERCENTILES: [f64; 5] = [0.05, 0.25, 0.5, 0.75, 0.95];
 
 /// The paper's tables for which there is a run.
-pub fn of_the_paper(groups: &[Group]) -> Vec<Table> {
-    TABLES.iter().filter_map(|table| beside_ours(table, groups)).collect()
+pub fn of_the_paper(groups: &[Group], options: &Options) -> Vec<Table> {
+    TABLES.iter().filter_map(|table| beside_ours(table, groups, options)).collect()
 }
 
-fn beside_ours(table: &PaperTable, groups: &[Group]) -> Option<Table> {
+fn beside_ours(table: &PaperTable, groups: &[Group], options: &Options) -> Option<Table> {
     let group_of = |task_set: &str| {
         groups
             .iter()
@@ -59,10 +60,45 @@ fn beside_ours(table: &PaperTable, groups: &[Group]) -> Option<Table> {
         title: format!("Table {} of the paper: {}", table.number, table.title),
         head: ["method".to_owned()].into_iter().chain(columns.iter().flat_map(head)).collect(),
         rows: table.methods.iter().map(row).collect(),
-        note: "Mean ± standard error over seeds of the mean over unseen tasks (paper: five seeds); in parentheses our \
-               number of seeds. ▲ or ▼: ours is higher or lower by more than both errors together; of a single seed there \
-               is no error and no mark."
-            .to_owned(), ..Table::default() })
+        note: format!(
+            "Mean ± standard error over seeds of the mean over unseen tasks (paper: five seeds); in parentheses our number of \
+             seeds. ▲ or ▼: ours is higher or lower by more than both errors together; of a single seed there is no error and \
+             no mark. Variants, whose names say what was set, stand in the tables by task below.{}",
+            departures(&columns.iter().filter_map(|(_, _, group)| *group).collect::<Vec<_>>(), options)
+        ),
+        ..Table::default()
+    })
+}
+
+/// Where our runs are not what the paper's were, as far as that is known: a plain method's settings that are not those of the
+/// paper's tables, and games that are played elsewhere.
+fn departures(groups: &[&Group], options: &Options) -> String {
+    let mut words = String::new();
+    for group in groups {
+        let of = |settings: fn(&str, &str) -> Option<Settings>| {
+            settings(&group.task_set, "rit").unwrap_or_default()
+        };
+        let (plain, presets) = (of(options.plain), of(of_presets));
+        let differing: Vec<String> = plain
+            .iter()
+            .filter_map(|(key, value)| {
+                Some((key, value, presets.get(key).filter(|preset| *preset != value)?))
+            })
+            .map(|(key, value, preset)| format!("{key} = {value} in place of {preset}"))
+            .collect();
+        if !differing.is_empty() {
+            words += &format!(" {}, ours: {}.", group.title, differing.join(", "));
+        }
+    }
+    let in_game = |run: &Record| run.settings.get("environment.backend").is_some_and(|it| it == "starcraft");
+    let elsewhere = |group: &&&Group| {
+        paper::is_combat(&group.task_set)
+            && group.methods.iter().flat_map(|method| &method.runs).any(|run| !in_game(run))
+    };
+    if groups.iter().any(|group| elsewhere(&group)) {
+        words += " Our battles were played in a simulator and the paper's in StarCraft II: their win rates are not comparable.";
+    }
+    words
 }
 
 fn our_cell(measure: Measure, scores: &[f64], paper: Option<(f64, f64)>) -> String {
@@ -85,7 +121,8 @@ pub fn by_task(group: &Group) -> Table {
         format!("{task}{}", if *split == Split::Testing { " (unseen)" } else { "" })
     };
     let cell = |method: &Method, (split, task): &(Split, &String)| {
-        interval_cell(group.measure, &group.scores_of_task(method, *split, task))
+        let values = group.scores_of_task(method, *split, task);
+        interval_cell(group.measure, group.measure.range(), &values)
     };
     let method_name = |method: &Method| format!("{} ({})", method.label, method.runs.len());
     // What there is less of lies side by side.
@@ -111,16 +148,21 @@ pub fn by_task(group: &Group) -> Table {
         title: format!("{}: {} by task", group.title, group.measure.words()),
         head,
         rows,
-        note: "Mean over seeds of greedy episodes at the end of training, with its 95 % interval of Student's t; in \
-               parentheses the number of seeds. † fewer than 5 seeds: the interval is not reliable."
-            .to_owned(), ..Table::default() }
+        note: format!(
+            "Mean over seeds of greedy episodes at the end of training, with its 95 % interval of Student's t; in \
+             parentheses the number of seeds. † fewer than 5 seeds: the interval is not reliable.{}",
+            Measure::ends("Intervals", [group.measure])
+        ),
+        ..Table::default()
+    }
 }
 
-/// Mean and interval.
-fn interval_cell(measure: Measure, values: &[f64]) -> String {
+/// Mean and interval, of values that lie in this range.
+fn interval_cell(measure: Measure, range: Option<[f64; 2]>, values: &[f64]) -> String {
     let text = measure.number(mean(values));
     let number = |value: f64| measure.number(value);
-    match t_interval(values) {
+    let interval = t_interval(values).map(|it| range.map_or(it, |range| it.within(range)));
+    match interval {
         Some(it) if values.len() >= rit_statistics::SEEDS_MIN => {
             format!("{text} [{}, {}]", number(it.low), number(it.high))
         }
@@ -139,9 +181,12 @@ pub fn gaps(groups: &[Group]) -> Option<Table> {
             Some((seen, unseen, generalisation_gap(&[seen], &[unseen])))
         };
         let all: Vec<(f64, f64, f64)> = method.runs.iter().filter_map(of_run).collect();
+        // A difference of two values lies between the differences of their ends.
+        let range = measure.range();
+        let ranges = [range, range, range.map(|[low, high]| [low - high, high - low])];
         let [seen, unseen, gap] = [0, 1, 2].map(|at| {
             let values = all.iter().map(|it| [it.0, it.1, it.2][at]).collect::<Vec<_>>();
-            interval_cell(measure, &values)
+            interval_cell(measure, ranges[at], &values)
         });
         let head = format!("{}: {}", group.title, method.label);
         (!all.is_empty()).then(|| vec![head, seen, unseen, gap, all.len().to_string()])
@@ -156,14 +201,18 @@ pub fn gaps(groups: &[Group]) -> Option<Table> {
         title: "Generalisation gap: training tasks minus unseen tasks".to_owned(),
         head: ["method", "training tasks", "unseen tasks", "gap", "seeds"].map(str::to_owned).to_vec(),
         rows,
-        note: "Mean over seeds with its 95 % interval of Student's t († fewer than 5 seeds: not reliable). Returns of \
-               unseen tasks are sums over other numbers of agents, so a gap of returns is to be compared between methods \
-               and not with 0; a gap of win rates is what it says."
-            .to_owned(), ..Table::default() })
+        note: format!(
+            "Mean over seeds with its 95 % interval of Student's t († fewer than 5 seeds: not reliable).{} Returns of unseen \
+             tasks are sums over other numbers of agents, so a gap of returns is to be compared between methods and not with \
+             0; a gap of win rates is what it says.",
+            Measure::ends("Intervals", groups.iter().map(|group| group.measure))
+        ),
+        ..Table::default()
+    })
 }
 
-/// How the runs of a method vary.
-pub fn variation(groups: &[Group]) -> Table {
+/// How the runs of a method vary, where there are several.
+pub fn variation(groups: &[Group]) -> Option<Table> {
     let row = |group: &Group, method: &Method, split: Split| {
         let scores = group.scores(method, split);
         let numbers = PERCENTILES.map(|share| group.measure.number(percentile(&scores, share)));
@@ -183,16 +232,42 @@ pub fn variation(groups: &[Group]) -> Table {
     };
     let rows = groups.iter().flat_map(|group| {
         splits(group).into_iter().flat_map(move |split| {
-            group.methods.iter().map(move |method| row(group, method, split)).collect::<Vec<_>>()
+            let several = group.methods.iter().filter(|method| method.runs.len() > 1);
+            several.map(|method| row(group, method, split)).collect::<Vec<_>>()
         })
     });
+    let rows: Vec<_> = rows.collect();
     let percentiles = PERCENTILES.map(|share| format!("{} %", signed(100.0 * share, 0)));
     let head = ["method", "tasks"].map(str::to_owned).into_iter().chain(percentiles);
-    Table {
+    (!rows.is_empty()).then(|| Table {
         id: "run-to-run".to_owned(),
         title: "How runs vary: percentiles over seeds".to_owned(),
         head: head.chain(["75 % − 25 %".to_owned(), "seeds".to_owned()]).collect(),
-        rows: rows.collect(),
-        note: "Of each run's mean over tasks at the end of training; between two runs percentiles lie on a straight line."
-            .to_owned(), ..Table::default() }
+        rows,
+        note: "Of each run's mean over tasks at the end of training; between two runs percentiles lie on a straight line. \
+               Methods with a single run are left out."
+            .to_owned(),
+        ..Table::default()
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Mean 0.9, error 0.1, t(4) = 2.7764 (see `figures.rs`); of three, mean 0.8333, error 0.1667, t(2) = 4.3027.
+    #[test]
+    fn an_interval_of_win_rates_ends_at_0_and_1() {
+        let values = [1.0, 0.5, 1.0, 1.0, 1.0];
+        let cell = |values: &[f64]| interval_cell(Measure::WinRate, Measure::WinRate.range(), values);
+        assert_eq!(cell(&values), "0.90 [0.62, 1.00]");
+        assert_eq!(cell(&values[..3]), "0.83 [0.12, 1.00]†");
+        assert_eq!(cell(&values[..1]), "1.00");
+        assert_eq!(interval_cell(Measure::Return, Measure::Return.range(), &values), "0.9 [0.6, 1.2]");
+        // A gap may be below nought.
+        assert_eq!(
+            interval_cell(Measure::WinRate, Some([-1.0, 1.0]), &[-0.5, 0.5, 0.0]),
+            "0.00 [−1.00, 1.00]†"
+        );
+    }
 }

@@ -1,42 +1,65 @@
 //! The table of everything that is not the algorithm: settings, builds, machines, what runs took, how they were evaluated.
 
-use crate::{comparison::Group, table::Table};
+use crate::{
+    comparison::{Group, Method},
+    paper,
+    table::Table,
+};
 use rit_env::Split;
 use rit_record::{Occasion, Record};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Settings that say where a run is and not what it is.
-const LEFT_OUT: [&str; 3] = ["learner.tls.", "learner.token_file", "learner.listen"];
+/// Settings that say where a run is and not what it is, and those that every name says.
+const LEFT_OUT: [&str; 5] =
+    ["learner.tls", "learner.token_file", "learner.listen", "algorithm.name", "environment.task_set"];
 
-/// What was run.
-pub fn runs(groups: &[Group]) -> Table {
-    let row = |group: &Group, label: &str, run: &Record| {
-        let or_dash =
-            |text: Option<String>| text.filter(|text| !text.is_empty()).unwrap_or_else(|| "–".to_owned());
-        let seconds = |seconds: Option<f64>| or_dash(seconds.map(|seconds| grouped(seconds.round() as u64)));
-        let build = run.build.as_ref();
-        let commit = build.and_then(|build| build.commit.clone()).unwrap_or_default();
-        let commit: String = commit.chars().take(12).collect();
-        let version = build.map(|build| format!("{} {commit}", build.version).trim().to_owned());
-        let machine = run.host.as_ref().map(|host| format!("{} ({} cores)", host.cpu, host.cores));
-        let digest = run.weights_digest.as_ref().map(|digest| digest.chars().take(12).collect());
-        vec![
-            format!("{}: {label}", group.title),
-            or_dash(run.seed.map(|seed| seed.to_string())),
-            grouped(run.progress.env_steps),
-            grouped(run.progress.episodes),
-            grouped(run.progress.updates),
-            or_dash(run.parameters.map(grouped)),
-            seconds(run.cpu_s),
-            seconds(run.wall_s),
-            or_dash(version),
-            or_dash(machine),
-            or_dash(digest),
-        ]
+/// What each method is, and how many seeds of it there are on each task set.
+pub fn methods(groups: &[Group]) -> Table {
+    let mut labels: Vec<&Method> = Vec::new();
+    for method in groups.iter().flat_map(|group| &group.methods) {
+        if !labels.iter().any(|other| other.label == method.label) {
+            labels.push(method);
+        }
+    }
+    labels.sort_by_key(|method| (paper::method_place(&method.label), method.label.clone()));
+    let row = |method: &&Method| {
+        let name = method.runs[0].method();
+        let facts = rit_algo::Method::ALL.map(rit_algo::Method::facts);
+        let words =
+            facts.into_iter().find(|facts| Some(facts.name) == name).map_or("–", |facts| facts.summary);
+        let seeds = groups.iter().map(|group| {
+            let found = group.methods.iter().find(|other| other.label == method.label);
+            found.map_or_else(|| "–".to_owned(), |found| found.runs.len().to_string())
+        });
+        [method.label.clone(), words.to_owned()].into_iter().chain(seeds).collect()
     };
-    let methods = groups.iter().flat_map(|group| group.methods.iter().map(move |method| (group, method)));
-    let runs = methods.flat_map(|(group, method)| method.runs.iter().map(move |run| (group, method, run)));
-    let rows = runs.map(|(group, method, run)| row(group, &method.label, run));
+    let titles = groups.iter().map(|group| group.title.clone());
+    Table {
+        id: "methods".to_owned(),
+        title: "Methods, and seeds of each by task set".to_owned(),
+        head: ["method", "what it is"].map(str::to_owned).into_iter().chain(titles).collect(),
+        rows: labels.iter().map(row).collect(),
+        note: "A method's plain name stands for the settings that come with the task set; what else was set follows the name. \
+               – : no finished run."
+            .to_owned(),
+        ..Table::default()
+    }
+}
+
+/// What was run; then what trained it and where, each pair of build and machine once.
+pub fn runs(groups: &[Group]) -> [Table; 2] {
+    let mut makers: Vec<[String; 2]> = Vec::new();
+    let mut rows = Vec::new();
+    for (group, method) in groups.iter().flat_map(|group| group.methods.iter().map(move |it| (group, it))) {
+        for run in &method.runs {
+            let maker = maker(run);
+            let at = makers.iter().position(|other| *other == maker).unwrap_or_else(|| {
+                makers.push(maker);
+                makers.len() - 1
+            });
+            rows.push(run_row(&format!("{}: {}", group.title, method.label), run, at + 1));
+        }
+    }
     let head = [
         "run",
         "seed",
@@ -46,75 +69,153 @@ pub fn runs(groups: &[Group]) -> Table {
         "parameters",
         "CPU s",
         "wall s",
-        "build",
-        "machine",
+        "made by",
         "weights",
     ];
-    Table {
+    let runs = Table {
         id: "runs".to_owned(),
         title: "Runs".to_owned(),
         head: head.map(str::to_owned).to_vec(),
-        rows: rows.collect(),
-        note: "CPU s: processor time of all processes of a run, evaluations included; wall s: how long learners ran. \
-               Weights: the beginning of the SHA-256 of the final weights. – : the record does not say."
-            .to_owned(), ..Table::default() }
+        rows,
+        note: "CPU s: processor time of all processes of a run, evaluations included; wall s: how long learners ran. Made by: \
+               the number of build and machine in the table below. Weights: the beginning of the SHA-256 of the final \
+               weights. – : the record does not say."
+            .to_owned(),
+        ..Table::default()
+    };
+    let made_by = |(at, [build, machine]): (usize, [String; 2])| vec![format!("{}", at + 1), build, machine];
+    let builds = Table {
+        id: "builds".to_owned(),
+        title: "Builds and machines".to_owned(),
+        head: ["made by", "version and commit", "machine"].map(str::to_owned).to_vec(),
+        rows: makers.into_iter().enumerate().map(made_by).collect(),
+        ..Table::default()
+    };
+    [runs, builds]
+}
+
+/// The text, or a dash for none.
+fn or_dash(text: Option<String>) -> String {
+    text.filter(|text| !text.is_empty()).unwrap_or_else(|| "–".to_owned())
+}
+
+/// Build and machine of a run.
+fn maker(run: &Record) -> [String; 2] {
+    let build = run.build.as_ref();
+    let commit = build.and_then(|build| build.commit.clone()).unwrap_or_default();
+    let commit: String = commit.chars().take(12).collect();
+    let version = build.map(|build| format!("{} {commit}", build.version).trim().to_owned());
+    let cores = |cores: usize| format!("{cores} core{}", if cores == 1 { "" } else { "s" });
+    let machine = run.host.as_ref().map(|host| format!("{}, {}", host.cpu, cores(host.cores)));
+    [or_dash(version), or_dash(machine)]
+}
+
+fn run_row(name: &str, run: &Record, maker: usize) -> Vec<String> {
+    let seconds = |seconds: Option<f64>| or_dash(seconds.map(|seconds| grouped(seconds.round() as u64)));
+    let digest = run.weights_digest.as_ref().map(|digest| digest.chars().take(12).collect());
+    vec![
+        name.to_owned(),
+        or_dash(run.seed.map(|seed| seed.to_string())),
+        grouped(run.progress.env_steps),
+        grouped(run.progress.episodes),
+        grouped(run.progress.updates),
+        or_dash(run.parameters.map(grouped)),
+        seconds(run.cpu_s),
+        seconds(run.wall_s),
+        maker.to_string(),
+        or_dash(digest),
+    ]
+}
+
+/// One method on one task set, and its settings as this build has them.
+struct Cell<'a> {
+    group: &'a Group,
+    method: &'a Method,
+    settings: BTreeMap<String, String>,
 }
 
 /// What all runs have in common, and what sets methods apart.
 pub fn settings(groups: &[Group]) -> Vec<Table> {
-    let all: Vec<(String, &Record)> = groups
+    let all: Vec<Cell> = groups
         .iter()
-        .flat_map(|group| {
-            group.methods.iter().map(move |it| (format!("{}: {}", group.title, it.label), &it.runs[0]))
+        .flat_map(|group| group.methods.iter().map(move |method| (group, method)))
+        .map(|(group, method)| {
+            let settings = rit_config::completed(method.runs[0].settings.clone());
+            Cell { group, method, settings }
         })
-        .filter(|(_, run)| !run.settings.is_empty())
+        .filter(|cell| !cell.method.runs[0].settings.is_empty())
         .collect();
     if all.is_empty() {
         return Vec::new();
     }
     let is_shown = |key: &&String| *key != "seed" && !LEFT_OUT.iter().any(|out| key.starts_with(out));
-    let keys: BTreeSet<&String> =
-        all.iter().flat_map(|(_, run)| run.settings.keys()).filter(is_shown).collect();
-    let values = |key: &str| -> BTreeSet<Option<&String>> {
-        all.iter().map(|(_, run)| run.settings.get(key)).collect()
-    };
-    let (shared, other): (Vec<_>, Vec<_>) = keys.into_iter().partition(|key| values(key).len() == 1);
+    let keys: BTreeSet<&String> = all.iter().flat_map(|cell| cell.settings.keys()).filter(is_shown).collect();
+    let values =
+        |key: &str| -> BTreeSet<&String> { all.iter().filter_map(|cell| cell.settings.get(key)).collect() };
+    let in_all =
+        |key: &&String| values(key).len() == 1 && all.iter().all(|cell| cell.settings.contains_key(*key));
+    let (shared, other): (Vec<_>, Vec<_>) = keys.into_iter().partition(in_all);
     let shared = Table {
         id: "settings-shared".to_owned(),
         title: "Settings that all runs share".to_owned(),
         head: ["key", "value"].map(str::to_owned).to_vec(),
-        rows: shared.into_iter().map(|key| vec![key.clone(), all[0].1.settings[key].clone()]).collect(),
-        note: String::new(),
+        rows: shared.into_iter().map(|key| vec![key.clone(), shown(&all[0].settings[key])]).collect(),
         ..Table::default()
-    };
-    let row = |key: &String| {
-        let mut holders: BTreeMap<String, Vec<&str>> = BTreeMap::new();
-        for (name, run) in &all {
-            let value = run.settings.get(key).cloned().unwrap_or_else(|| "(has no such key)".to_owned());
-            holders.entry(value).or_default().push(name);
-        }
-        // The value that most have needs no list of names.
-        let most = holders.values().map(Vec::len).max().unwrap_or(0);
-        let mut said_most = false;
-        let words = holders.iter().map(|(value, names)| {
-            if names.len() == most && names.len() > 3 && !said_most {
-                said_most = true;
-                format!("{value}: the others")
-            } else {
-                format!("{value}: {}", names.join(", "))
-            }
-        });
-        vec![key.clone(), words.collect::<Vec<_>>().join("; ")]
     };
     let other = Table {
         id: "settings-other".to_owned(),
         title: "Settings that differ".to_owned(),
         head: ["key", "value: where"].map(str::to_owned).to_vec(),
-        rows: other.into_iter().map(row).collect(),
-        note: String::new(),
+        rows: other.into_iter().map(|key| vec![key.clone(), holders(key, &all)]).collect(),
+        note: "A task set's name alone: all methods there that have the key. Methods without a key are not named."
+            .to_owned(),
         ..Table::default()
     };
     if other.rows.is_empty() { vec![shared] } else { vec![other, shared] }
+}
+
+fn shown(value: &str) -> String {
+    if value.is_empty() { "(empty)".to_owned() } else { value.to_owned() }
+}
+
+/// Each value of a key, and who has it, in as few words as say it.
+fn holders(key: &str, all: &[Cell]) -> String {
+    let mut of_value: BTreeMap<&str, Vec<&Cell>> = BTreeMap::new();
+    let having: Vec<&Cell> = all.iter().filter(|cell| cell.settings.contains_key(key)).collect();
+    for cell in &having {
+        of_value.entry(&cell.settings[key]).or_default().push(cell);
+    }
+    if of_value.len() == 1 {
+        // A key that some methods have and others do not.
+        return of_value.into_keys().map(shown).collect();
+    }
+    let in_group = |cells: &[&Cell], id: &str| cells.iter().filter(|cell| cell.group.id == id).count();
+    let named = |cells: &[&Cell]| {
+        let mut names: Vec<String> = Vec::new();
+        for cell in cells {
+            let Group { id, title, .. } = cell.group;
+            let is_whole = in_group(cells, id) == in_group(&having, id);
+            let name = if is_whole { title.clone() } else { format!("{title}: {}", cell.method.label) };
+            if !names.contains(&name) {
+                names.push(name);
+            }
+        }
+        names
+    };
+    let named: Vec<(&str, Vec<String>)> =
+        of_value.into_iter().map(|(value, cells)| (value, named(&cells))).collect();
+    // The value with most names needs none of them.
+    let most = named.iter().map(|(_, names)| names.len()).max().unwrap_or(0);
+    let longest = named.iter().position(|(_, names)| names.len() == most && most > 3);
+    let words = named.iter().enumerate().map(|(at, (value, names))| {
+        let value = shown(value);
+        if Some(at) == longest {
+            format!("{value}: the others")
+        } else {
+            format!("{value}: {}", names.join(", "))
+        }
+    });
+    words.collect::<Vec<_>>().join("; ")
 }
 
 /// How runs were evaluated.
@@ -135,15 +236,15 @@ pub fn protocol(groups: &[Group]) -> Table {
             (Some(low), _) => grouped(*low),
             _ => "–".to_owned(),
         };
-        let or_dash = |text: String| if text.is_empty() { "–".to_owned() } else { text };
+        let number = |text: String| text.parse().map_or(text, grouped);
         vec![
             group.title.clone(),
             steps,
-            or_dash(interval.unwrap_or_default()),
-            or_dash(group.training.join(", ")),
-            or_dash(episodes(Split::Training)),
-            or_dash(group.testing.join(", ")),
-            or_dash(episodes(Split::Testing)),
+            or_dash(interval.map(number)),
+            or_dash(Some(group.training.join(", "))),
+            or_dash(Some(episodes(Split::Training))),
+            or_dash(Some(group.testing.join(", "))),
+            or_dash(Some(episodes(Split::Testing))),
             format!("{best} of {}", runs().count()),
         ]
     };

@@ -2,6 +2,9 @@
 
 use std::fmt::Write as _;
 
+/// Tables of no more rows are printed on one page.
+const SHORT: usize = 16;
+
 /// A table.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Table {
@@ -46,15 +49,18 @@ impl Table {
             let cells = cells.iter().enumerate().map(|(at, cell)| {
                 let tag = if at == 0 { "th" } else { tag };
                 let class = if self.is_text(at) { "" } else { " class=\"n\"" };
+                let cell = if tag == "td" && !self.is_text(at) { unbroken(cell) } else { cell.clone() };
                 let cell = match link {
-                    Some(link) if at == 0 => format!("<a href=\"{}\">{}</a>", escaped(link), escaped(cell)),
-                    _ => escaped(cell),
+                    Some(link) if at == 0 => format!("<a href=\"{}\">{}</a>", escaped(link), escaped(&cell)),
+                    _ => escaped(&cell),
                 };
                 format!("<{tag}{class}>{cell}</{tag}>")
             });
             format!("<tr>{}</tr>\n", cells.collect::<String>())
         };
-        let mut html = format!("<figure class=\"table\" id=\"{}\">\n", escaped(&self.id));
+        // On paper a table goes on over pages only if it has to.
+        let length = if self.rows.len() <= SHORT { " short" } else { "" };
+        let mut html = format!("<figure class=\"table{length}\" id=\"{}\">\n", escaped(&self.id));
         // Writing to a String does not fail.
         let _ =
             write!(html, "<figcaption>{}</figcaption>\n<div class=\"wide\"><table>\n", escaped(&self.title));
@@ -67,6 +73,11 @@ impl Table {
         }
         html + "</figure>\n"
     }
+}
+
+/// Numbers of which lines end before an interval in brackets and nowhere else.
+fn unbroken(cell: &str) -> String {
+    cell.replace(' ', "\u{a0}").replace("\u{a0}[", " [")
 }
 
 /// Text as HTML shows it.
@@ -84,16 +95,17 @@ mod tests {
             id: "t".to_owned(),
             title: "A <b>".to_owned(),
             head: vec!["method".to_owned(), "x|y".to_owned()],
-            rows: vec![vec!["a & b".to_owned(), "−1.0".to_owned()]],
+            rows: vec![vec!["a & b".to_owned(), "−1.0 [−2.0, 0.5]†".to_owned()]],
             links: vec!["/a?b&c".to_owned()],
             note: "\"n\"".to_owned(),
         };
-        let expected = "# A <b>\n\n| method | x\\|y |\n| --- | ---: |\n| a & b | −1.0 |\n\n\"n\"\n";
+        let expected =
+            "# A <b>\n\n| method | x\\|y |\n| --- | ---: |\n| a & b | −1.0 [−2.0, 0.5]† |\n\n\"n\"\n";
         assert_eq!(table.markdown(), expected);
         let html = table.html();
         let parsed = roxmltree::Document::parse(&html).unwrap();
         let cells = parsed.descendants().filter(|node| node.has_tag_name("td"));
-        assert_eq!(cells.map(|cell| cell.text().unwrap()).collect::<Vec<_>>(), ["−1.0"]);
+        assert_eq!(cells.map(|cell| cell.text().unwrap()).collect::<Vec<_>>(), ["−1.0 [−2.0,\u{a0}0.5]†"]);
         assert!(
             html.contains("<a href=\"/a?b&amp;c\">a &amp; b</a>") && html.contains("A &lt;b&gt;"),
             "{html}"

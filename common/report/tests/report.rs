@@ -129,7 +129,7 @@ fn comparison(folder: &Path) -> Vec<PathBuf> {
 #[test]
 fn what_cannot_be_averaged_or_compared_is_refused_in_words() {
     let first = Run::new("rit", 1);
-    let cases: [(Vec<Run>, &[&str]); 6] = [
+    let cases: [(Vec<Run>, &[&str]); 7] = [
         (
             vec![first.clone(), Run::new("rit", 2).with("training.t_max", "80")],
             &["training.t_max (40, 80)", "not averaged", "--by training.t_max"],
@@ -148,6 +148,10 @@ fn what_cannot_be_averaged_or_compared_is_refused_in_words() {
         ),
         (
             vec![first.clone(), Run { version: "0.2.0", ..Run::new("rit", 2) }],
+            &["version 0.1.0", "version 0.2.0", "train them again"],
+        ),
+        (
+            vec![first.clone(), Run { version: "0.2.0", ..Run::new("mat", 1) }],
             &["version 0.1.0", "version 0.2.0", "train them again"],
         ),
         (
@@ -192,6 +196,16 @@ fn configurations_are_compared_where_that_is_asked_for() {
     let (groups, _) = finished(&input, &options).unwrap();
     let labels: Vec<&str> = groups[0].methods.iter().map(|method| method.label.as_str()).collect();
     assert_eq!(labels, ["rit", "rit gamma=0.8"]);
+    // The paper's figure has the plain method; what else was tried has one of its own, beside it.
+    let made = made(&[folder.path().to_owned()], &options).unwrap();
+    assert!(!text(&made, "figures/figure-2.svg").contains("gamma=0.8"));
+    let other = text(&made, "figures/curves-cooperative-navigation-other-settings.svg");
+    assert!(other.contains("rit gamma=0.8") && other.contains(">rit</text>"), "{other}");
+    // Where the plain name means something else, the other one is the variant.
+    let plain = |_: &str, _: &str| Some([("algorithm.gamma".to_owned(), "0.8".to_owned())].into());
+    let (groups, _) = finished(&input, &Options { plain, ..options }).unwrap();
+    let labels: Vec<&str> = groups[0].methods.iter().map(|method| method.label.as_str()).collect();
+    assert_eq!(labels, ["rit", "rit gamma=0.99"]);
 }
 
 #[test]
@@ -257,14 +271,20 @@ fn few_seeds_are_said_and_drawn_one_by_one() {
         (1..=3).map(|seed| Run::new("rit", seed).write(folder.path(), &format!("seed-{seed}"))).collect();
     let made = made(&paths, &options()).unwrap();
     let page = text(&made, "index.html");
-    assert!(page.contains("1 of 1 method has fewer than 5 seeds: the intervals are not reliable."), "{page}");
+    assert!(
+        page.contains(
+            "1 of 1 cell (a method on a task set) has fewer than 5 seeds: the intervals are not reliable."
+        ),
+        "{page}"
+    );
     assert!(text(&made, "tables/tasks-cooperative-navigation.md").contains("]†"));
     // The mean and three runs; no band.
     let figure = text(&made, "figures/figure-2.svg");
     let parsed = roxmltree::Document::parse(&figure).unwrap();
-    assert_eq!(parsed.descendants().filter(|node| node.has_tag_name("polygon")).count(), 0);
-    let thin = parsed.descendants().filter(|node| node.attribute("opacity") == Some("0.35"));
-    assert_eq!(thin.count(), 3);
+    let with = |name: &'static str| parsed.descendants().filter(move |node| node.has_attribute(name));
+    assert_eq!(with("fill-opacity").count(), 0);
+    let thin: Vec<_> = with("stroke-opacity").map(|group| group.children().count()).collect();
+    assert_eq!(thin, [3], "three runs, drawn alike");
 }
 
 #[test]
@@ -321,13 +341,19 @@ fn a_sweep_that_still_runs_says_what_is_missing() {
     let cell = |name: &str, seed: u64| json!({ "name": name, "experiment": "cooperative-navigation", "seed": seed, "settings": {} });
     let sweep = json!({
         "format_version": 1, "axes": ["algorithm.name"],
-        "cells": [cell("rit-seed-2", 2), cell("rit-seed-3", 3)],
+        "cells": [cell("rit-seed-2", 2), cell("rit-seed-3", 3), cell("rit-seed-4", 4)],
     });
+    // One that failed before it began has left nothing but its words.
+    fs::create_dir(folder.path().join("logs")).unwrap();
+    fs::write(folder.path().join("logs/rit-seed-3.log"), "begins\nerror: no such token\n").unwrap();
     fs::write(folder.path().join("sweep.json"), sweep.to_string()).unwrap();
     let made = made(&[folder.path().to_owned()], &options()).unwrap();
     let said = made.said.join("\n");
     assert!(
-        said.contains("2 of 2 runs are missing: rit-seed-2 (has not begun), rit-seed-3 (has not begun)."),
+        said.contains(
+            "3 of 3 runs are missing: rit-seed-2 (has not begun), rit-seed-3 (failed: no such token), rit-seed-4 (has not \
+             begun)."
+        ),
         "{said}"
     );
 }

@@ -30,6 +30,15 @@ pub struct Interval {
     pub high: f64,
 }
 
+impl Interval {
+    /// What of it lies in a range. A mean of values that lie there lies there too, so what is cut off holds nothing, and the
+    /// interval covers the mean as often as before.
+    #[must_use]
+    pub fn within(self, [lowest, highest]: [f64; 2]) -> Self {
+        Self { low: self.low.clamp(lowest, highest), high: self.high.clamp(lowest, highest) }
+    }
+}
+
 /// A value and where it lies.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Estimate {

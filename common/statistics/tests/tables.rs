@@ -41,6 +41,20 @@ fn mean_deviation_and_interval_over_seeds() {
 }
 
 #[test]
+fn an_interval_ends_where_the_measure_does() {
+    // Win rates 1, 1, 1, 0.5: mean 0.875, s = 0.25, s/√4 = 0.125, t(3) = 3.18245: 0.875 ± 0.39781.
+    let interval = t_interval(&[1.0, 1.0, 1.0, 0.5]).unwrap();
+    assert!((interval.high - 1.272_806).abs() < 1e-5, "{interval:?}");
+    let within = interval.within([0.0, 1.0]);
+    assert!((within.low - 0.477_194).abs() < 1e-5, "{within:?}");
+    near(within.high, 1.0);
+    // 0, 0, 0.3: mean 0.1, error 0.1, t(2) = 4.30265.
+    let within = t_interval(&[0.0, 0.0, 0.3]).unwrap().within([0.0, 1.0]);
+    near(within.low, 0.0);
+    assert!((within.high - 0.530_265).abs() < 1e-5, "{within:?}");
+}
+
+#[test]
 fn percentiles_lie_between_two_values_in_a_straight_line() {
     let values = [10.0, 40.0, 20.0, 30.0];
     for (share, expected) in [(0.0, 10.0), (0.25, 17.5), (0.5, 25.0), (0.9, 37.0), (1.0, 40.0)] {

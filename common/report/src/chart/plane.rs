@@ -1,8 +1,8 @@
 //! The plane of a chart: its frame, grid, numbers and words, and the ranges that it shows.
 
-use super::{Area, FRAME, Plane};
+use super::{Area, FRAME, GRID, Plane, TICK, px};
 use crate::measure::signed;
-use plotters::prelude::{ChartBuilder, IntoFont as _, RGBColor, TextStyle, WHITE};
+use plotters::prelude::{ChartBuilder, Color as _, IntoFont as _, TextStyle};
 use std::error::Error;
 
 /// What is written around a chart.
@@ -22,18 +22,19 @@ pub(super) fn plane<'a>(
     [bottom, top]: [f64; 2],
 ) -> Result<Plane<'a>, Box<dyn Error + Send + Sync>> {
     let mut plane = ChartBuilder::on(area)
-        .margin(10)
-        .margin_right(18)
+        .margin(px(10))
+        .margin_right(px(18))
         .caption(labels.title, text(18))
-        .x_label_area_size(46)
-        .y_label_area_size(66)
+        .x_label_area_size(px(46))
+        .y_label_area_size(px(66))
         .build_cartesian_2d(left..right, bottom..top)?;
     let (x_tick, y_tick) = (ticks(left, right), ticks(bottom, top));
     plane
         .configure_mesh()
-        .light_line_style(WHITE)
-        .bold_line_style(RGBColor(232, 232, 232))
-        .axis_style(FRAME)
+        .max_light_lines(0)
+        .set_all_tick_mark_size(px(TICK))
+        .bold_line_style(GRID.stroke_width(px(1)))
+        .axis_style(FRAME.stroke_width(px(1)))
         .x_labels(labels.x_ticks)
         .y_labels(6)
         .x_label_formatter(&|x| x_tick(*x))
@@ -46,8 +47,9 @@ pub(super) fn plane<'a>(
     Ok(plane)
 }
 
+/// Words of this size, in pixels.
 pub(super) fn text(size: u32) -> TextStyle<'static> {
-    TextStyle::from(("sans-serif", size).into_font())
+    TextStyle::from(("sans-serif", px(size)).into_font())
 }
 
 /// The lowest and the highest; where they are one, with room about it: an axis has a length.
