@@ -1,4 +1,4 @@
-//! What can be said of graphs without a runtime; `deploy/python/tests/test_onnx.py` runs them in one.
+//! What can be said of graphs without a runtime; `deploy/python/tests/test_export.py` runs them in one.
 
 use super::*;
 use crate::messages::{ModelProto, TensorProto, ValueInfoProto};

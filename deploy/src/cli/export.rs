@@ -7,9 +7,10 @@ use std::path::PathBuf;
 
 /// What comes out, and where the pages on it are.
 const FORMATS: &str = "\
---onnx writes encoder.onnx and head.onnx, weights inside, which any ONNX runtime acts with: deploy/docs/weights.md.
+--onnx writes encoder.onnx and head.onnx, weights inside, which any ONNX runtime acts with.
 --episodes writes one safetensors file, which NumPy and PyTorch load as it is, and of which the Python package makes Minari
-datasets (rit.episodes.to_minari): deploy/docs/episodes.md. Episodes are those that `rit evaluate` measures with the same seed.";
+datasets (rit.episodes.to_minari). Episodes are those that `rit evaluate` measures with the same seed.
+The page deploy/docs/export.md describes both.";
 
 #[derive(Args, Debug)]
 #[command(after_help = FORMATS)]

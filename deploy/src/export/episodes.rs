@@ -1,4 +1,4 @@
-//! Episodes as tensors: `deploy/docs/episodes.md` says which.
+//! Episodes as tensors; `deploy/docs/export.md` lists them.
 
 use crate::player::Player;
 use rit_env::Task;
