@@ -65,7 +65,7 @@ mod tests {
     use rit_env::EnvironmentError;
 
     fn lost(number: u64, kind: FailureKind, detail: &str) -> LostEpisode {
-        let error = EnvironmentError { kind, detail: detail.into() };
+        let error = EnvironmentError::new(kind, detail);
         LostEpisode { number, task: "3m".into(), error }
     }
 

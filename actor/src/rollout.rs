@@ -32,6 +32,7 @@ pub enum RolloutError {
         /// As many as `environment.lost_rounds_max` allows.
         rounds: usize,
         /// The last.
+        #[source]
         lost: LostEpisode,
     },
     /// An episode that does not fit the run's dims.

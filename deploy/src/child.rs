@@ -1,7 +1,7 @@
 //! How this program starts itself again, as a child process.
 
 use command_fds::{CommandFdExt as _, FdMapping};
-use rit_config::{RunLock, open_regular};
+use rit_config::{RunLock, open_regular, program_name};
 use std::{
     fs::{self, DirBuilder, OpenOptions},
     io::{self, ErrorKind},
@@ -17,14 +17,12 @@ use std::{
 };
 use tokio::process::Child;
 
-/// The program, as children are told it and as process lists show it.
-const PROGRAM: &str = "rit";
-
 /// A command that executes the program that is running, whatever has become of its file since: replaced by another
 /// build, moved, removed.
 pub fn this_program() -> Command {
     let mut command = Command::new("/proc/self/exe");
-    command.arg0(PROGRAM);
+    // Children are told it, and process lists show it.
+    command.arg0(program_name());
     command
 }
 
@@ -33,7 +31,7 @@ pub fn take_name() {
     const NAME: &str = "/proc/self/comm";
     if fs::read_to_string(NAME).is_ok_and(|name| name.trim_end() == "exe") {
         // For people's eyes alone.
-        let _ = fs::write(NAME, PROGRAM);
+        let _ = fs::write(NAME, program_name());
     }
 }
 

@@ -3,15 +3,16 @@
 mod comparison;
 mod ctl;
 mod export;
+mod program;
 mod starcraft;
 mod values;
 
 use crate::logging::LogOptions;
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use rit_config::count;
+use rit_config::{count, program_name};
 use rit_learner::{checkpoint::Which, run_handle::EPISODES_MAX};
 use rit_proto::transport::{Address, CredentialFiles, Credentials, CredentialsError};
-use std::{fmt, path::PathBuf};
+use std::{ffi::OsString, fmt, path::PathBuf};
 use values::{host, positive, which, within};
 
 pub use comparison::{
@@ -20,6 +21,7 @@ pub use comparison::{
 };
 pub use ctl::{CtlCommand, CtlOptions};
 pub use export::ExportOptions;
+pub use program::{command, parse};
 pub use starcraft::{EndpointOptions, GameOptions, StarCraftCheckOptions};
 
 /// Multi-task multi-agent reinforcement learning with interaction and task representations.
@@ -151,8 +153,9 @@ pub struct TrainOptions {
 /// When they are none, which is a fault of the program.
 pub fn train(arguments: &[String], json: bool) -> Result<TrainOptions, clap::Error> {
     let json = json.then(|| "--json".to_owned());
-    let cli =
-        Cli::try_parse_from(["rit".to_owned()].into_iter().chain(arguments.iter().cloned()).chain(json))?;
+    let program = program_name().to_owned();
+    let arguments = [program].into_iter().chain(arguments.iter().cloned()).chain(json);
+    let cli = parse(arguments.map(OsString::from))?;
     match cli.command {
         Command::Train(options) => Ok(options),
         _ => Err(clap::Error::new(clap::error::ErrorKind::InvalidSubcommand)),

@@ -8,7 +8,7 @@ use crate::{
     output::{self, Reader},
     report,
 };
-use rit_config::RunDir;
+use rit_config::{RunDir, in_program_words};
 use rit_proto::{
     transport::{self, Client},
     v1::{
@@ -226,5 +226,5 @@ fn status(status: &RunStatus, as_json: bool) -> Result<String, Failure> {
         text += &format!("\ngreedy evaluation at {} steps\n", grouped(evaluation.env_steps));
         text += &report::brief_table(&evaluation.tasks, "`rit ctl … --json status` has all");
     }
-    Ok(text)
+    Ok(in_program_words(&text).into_owned())
 }

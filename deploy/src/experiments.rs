@@ -2,7 +2,7 @@
 
 use crate::{cli::ConfigOptions, failure::Failure, output, python_worlds};
 use rit_algo::Method;
-use rit_config::{Config, read_text, resolve, set};
+use rit_config::{Config, in_program_words, read_text, resolve, set};
 use std::{collections::BTreeMap, path::Path, process::ExitCode};
 use toml::Table;
 
@@ -109,8 +109,9 @@ pub fn plain_settings(task_set: &str, method: &str) -> Option<BTreeMap<String, S
 
 fn unknown(experiment: &str) -> Failure {
     let likeness = |name: &str| strsim::jaro_winkler(experiment, name);
-    let closest =
-        EXPERIMENTS.map(|(name, _)| name).into_iter().max_by(|a, b| likeness(a).total_cmp(&likeness(b)));
+    let own = rit_env::registered().into_iter().map(|set| set.to_string());
+    let known = EXPERIMENTS.map(|(name, _)| name.to_owned()).into_iter().chain(own);
+    let closest = known.max_by(|a, b| likeness(a).total_cmp(&likeness(b)));
     let hint = closest.filter(|name| likeness(name) > 0.8).map(|name| format!("did you mean {name}? "));
     Failure::input_message(format!(
         "unknown experiment {experiment:?}; {}`rit experiments` lists them, a path ending in .toml is read",
@@ -127,12 +128,12 @@ pub fn print() -> Result<ExitCode, Failure> {
     let own = own.map(|set| format!("  {:38} this program's own task set\n", set.to_string()));
     let algorithms = Method::ALL.map(Method::facts);
     let algorithms = algorithms.map(|facts| format!("  {:38} {}\n", facts.name, facts.summary));
-    output::print(&format!(
+    output::print(&in_program_words(&format!(
         "experiments: task sets with their settings, `rit train EXPERIMENT`\n{}\nalgorithms: any of them on any task set, \
          `rit train EXPERIMENT --algorithm NAME`\n{}",
         experiments.into_iter().chain(own).collect::<String>(),
         algorithms.concat()
-    ))?;
+    )))?;
     Ok(ExitCode::SUCCESS)
 }
 

@@ -1,6 +1,6 @@
 //! How a command ends when it does not end well: a one-line message and an exit code.
 
-use crate::output;
+use crate::{output, traceback};
 use rit_actor::ActorError;
 use rit_config::{ConfigError, RunDirError};
 use rit_env::{TaskError, UnfitScript, UnknownName, rollout::LostEpisode};
@@ -51,8 +51,13 @@ impl Failure {
         Self::Runtime(anyhow::anyhow!("{message}"))
     }
 
-    /// Says the message; returns the exit code.
+    /// Says the message, and before it where in an environment's code it comes from; returns the exit code.
     pub fn report(&self) -> ExitCode {
+        let (Self::Input(error)
+        | Self::Runtime(error)
+        | Self::Unavailable(error)
+        | Self::Incompatible(error)) = self;
+        traceback::say(error);
         // The exit code says it too, should there be no reader.
         let _ = output::say(&format!("error: {self}"));
         ExitCode::from(match self {
@@ -242,7 +247,7 @@ mod tests {
         use rit_actor::RolloutError;
         use rit_env::{EnvironmentError, FailureKind};
         let failure = |kind| {
-            let error = EnvironmentError { kind, detail: "the bridge is out".into() };
+            let error = EnvironmentError::new(kind, "the bridge is out");
             let lost = LostEpisode { number: 7, task: "two".into(), error };
             Failure::from(ActorError::Rollout(RolloutError::Environment { rounds: 3, lost }))
         };

@@ -1,9 +1,10 @@
 //! What a process that ended said last: why it ended, if its log tells.
 
+use crate::traceback;
 use rit_config::open_regular;
 use std::{
     fs::OpenOptions,
-    io::{Read as _, Seek as _, SeekFrom},
+    io::{self, Read as _, Seek as _, SeekFrom},
     path::Path,
 };
 
@@ -13,16 +14,28 @@ const TAIL: u64 = 64 << 10;
 /// Why the process that writes this log ended, as far as it said. `begins_at` is the log's length when it started: what
 /// lies before is of others.
 pub fn last_words(log: &Path, begins_at: u64) -> String {
-    let mut bytes = Vec::new();
-    let read = open_regular(log, OpenOptions::new().read(true)).and_then(|mut file| {
-        let from = file.metadata()?.len().saturating_sub(TAIL).max(begins_at);
-        file.seek(SeekFrom::Start(from))?;
-        file.take(TAIL).read_to_end(&mut bytes)
-    });
-    match read {
-        Ok(_) => in_text(&String::from_utf8_lossy(&bytes)),
+    match tail(log, begins_at) {
+        Ok(text) => in_text(&text),
         Err(error) => format!("its log cannot be read: {error}"),
     }
+}
+
+/// The traceback of an environment that stands before the process's last error, without its marks.
+pub fn last_traceback(log: &Path, begins_at: u64) -> Option<String> {
+    let text = tail(log, begins_at).ok()?;
+    let lines: Vec<&str> = text.lines().collect();
+    let at = lines.iter().rposition(|line| line.starts_with("error: "))?;
+    let lines: Vec<&str> = traceback::before(&lines[..at]).into_iter().map(traceback::unmarked).collect();
+    (!lines.is_empty()).then(|| lines.join("\n"))
+}
+
+fn tail(log: &Path, begins_at: u64) -> io::Result<String> {
+    let mut bytes = Vec::new();
+    let mut file = open_regular(log, OpenOptions::new().read(true))?;
+    let from = file.metadata()?.len().saturating_sub(TAIL).max(begins_at);
+    file.seek(SeekFrom::Start(from))?;
+    file.take(TAIL).read_to_end(&mut bytes)?;
+    Ok(String::from_utf8_lossy(&bytes).into_owned())
 }
 
 /// The last error; a panic's message; else the last line that is no report of success.
@@ -112,6 +125,11 @@ mod tests {
         log.write_all(&vec![0xff; 200_000]).unwrap();
         log.write_all(b"\nerror: of this one\n").unwrap();
         assert_eq!(last_words(log.path(), begins_at), "of this one");
+        log.write_all(b"| File a.py\n| E: x\nerror: E: x (a.py)\n").unwrap();
+        assert_eq!(last_words(log.path(), begins_at), "E: x (a.py)");
+        assert_eq!(last_traceback(log.path(), begins_at).as_deref(), Some("File a.py\nE: x"));
+        log.write_all(b"error: another\n").unwrap();
+        assert_eq!(last_traceback(log.path(), begins_at), None);
         assert!(last_words(Path::new("/nowhere"), 0).starts_with("its log cannot be read: "));
     }
 }

@@ -60,15 +60,16 @@ mod soak;
 mod starcraft;
 mod supervisor;
 mod sweep;
+mod traceback;
 mod train;
 mod usage;
 mod warnings;
 mod watch;
 
-use clap::{CommandFactory as _, Parser as _};
 use cli::{Cli, Command, EnvCommand};
 use failure::Failure;
-use std::process::ExitCode;
+use rit_config::{program_name, set_program_name};
+use std::{env, path::Path, process::ExitCode};
 
 pub use rand;
 pub use rit_env::{
@@ -81,6 +82,7 @@ pub use rit_episode::{Action, End, Observation, Rng};
 #[derive(Debug, Default)]
 #[must_use = "main runs it"]
 pub struct Program {
+    name: Option<String>,
     task_sets: Vec<OwnTaskSet>,
 }
 
@@ -88,6 +90,12 @@ impl Program {
     /// What comes with it and nothing else.
     pub fn new() -> Self {
         Self::default()
+    }
+
+    /// What its help and its messages call it, in place of the name that its file has.
+    pub fn name(mut self, name: &str) -> Self {
+        self.name = Some(name.to_owned());
+        self
     }
 
     /// Adds a set of tasks: `train NAME` trains on it, and `environment.task_set = "NAME"` in an experiment's file.
@@ -99,6 +107,9 @@ impl Program {
     /// Does what the command line says. The program's `main` is to do nothing else: its learner and actors are processes that
     /// begin there too.
     pub fn main(self) -> ExitCode {
+        let file = env::args_os().next().unwrap_or_default();
+        let file = Path::new(&file).file_name().unwrap_or_default().to_string_lossy();
+        set_program_name(self.name.as_deref().unwrap_or(&file));
         child::take_name();
         for set in &self.task_sets {
             if let Err(error) = rit_env::register(set) {
@@ -111,7 +122,7 @@ impl Program {
 
 /// Does what the command line says.
 fn command() -> ExitCode {
-    let cli = match Cli::try_parse_from(starcraft::translate_game_options(std::env::args_os())) {
+    let cli = match cli::parse(starcraft::translate_game_options(env::args_os())) {
         Ok(cli) => cli,
         Err(error) => return usage::report(&error),
     };
@@ -159,7 +170,7 @@ async fn run(cli: Cli) -> Result<ExitCode, Failure> {
         Command::Experiments => experiments::print(),
         Command::Completions { shell } => {
             let mut script = Vec::new();
-            clap_complete::generate(shell, &mut Cli::command(), "rit", &mut script);
+            clap_complete::generate(shell, &mut cli::command(), program_name(), &mut script);
             output::print(&String::from_utf8_lossy(&script))?;
             Ok(ExitCode::SUCCESS)
         }

@@ -4,6 +4,7 @@
 //! enough, and is no failure; a full disk is one.
 
 use crate::failure::Failure;
+use rit_config::in_program_words;
 use std::io::{self, ErrorKind, Write as _};
 
 /// Whether what is printed still has a reader.
@@ -28,11 +29,11 @@ pub fn print(text: &str) -> Result<Reader, Failure> {
     }
 }
 
-/// Says something beside a command's result, as a line on standard error.
+/// Says something beside a command's result, as a line on standard error, in the words of the program that runs.
 ///
 /// # Errors
 /// When it cannot be written. Mostly that is to be ignored: who would be told?
 pub fn say(line: &str) -> io::Result<()> {
     // In one piece, so that lines of several processes on one terminal do not mix.
-    io::stderr().lock().write_all(format!("{line}\n").as_bytes())
+    io::stderr().lock().write_all(format!("{}\n", in_program_words(line)).as_bytes())
 }

@@ -5,6 +5,7 @@
 
 use crate::{output, report};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use rit_config::in_program_words;
 use rit_proto::v1::RunStatus;
 use std::{
     io::{self, IsTerminal as _},
@@ -76,8 +77,9 @@ impl Progress {
 
     /// Says what happened, on a line above the bar and in the log.
     pub fn say(&self, line: &str) {
+        let line = in_program_words(line);
         tracing::info!("{line}");
-        self.send(News::Line(line.to_owned()));
+        self.send(News::Line(line.into_owned()));
     }
 
     fn send(&self, news: News) {

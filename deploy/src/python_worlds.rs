@@ -1,6 +1,6 @@
 //! Environments in Python: what a run has to ask before it begins, and `rit env check`.
 
-use crate::{cli::EnvCheckOptions, experiments, failure::Failure, output, report};
+use crate::{cli::EnvCheckOptions, experiments, failure::Failure, output, report, traceback::marked};
 use rit_config::{Config, PythonAsked, World, python_answered, python_asked};
 use rit_env::Split;
 use rit_foreign::{Checked, Described, Launch};
@@ -19,7 +19,7 @@ pub fn described(text: &str, source_name: &str, settings: &[Table]) -> Result<Op
     let said = rit_foreign::describe(&Launch::of(&environment), &tasks);
     let Described { tasks, feature_names, action_names } = said.map_err(|error| {
         // The message is one line; who wrote the environment wants to see more.
-        let _ = error.traceback.as_ref().map(|traceback| output::say(traceback.trim_end()));
+        let _ = error.error.traceback.as_ref().map(|traceback| output::say(&marked(traceback)));
         Failure::input_message(format!("environment.python = {:?}, {error}", environment.python))
     })?;
     let world = |(task, opened): (String, rit_foreign::protocol::Opened)| World {
@@ -65,8 +65,11 @@ pub fn check(options: &EnvCheckOptions) -> Result<ExitCode, Failure> {
     }
     let mut all = Vec::new();
     for task in tasks {
-        let checked = rit_foreign::check(worlds.as_ref(), task, options.episodes.into())
-            .map_err(|broken| Failure::runtime_message(format!("a promise is broken: {broken}")))?;
+        let checked =
+            rit_foreign::check(worlds.as_ref(), task, options.episodes.into()).map_err(|broken| {
+                let _ = broken.traceback.as_ref().map(|traceback| output::say(&marked(traceback)));
+                Failure::runtime_message(format!("a promise is broken: {broken}"))
+            })?;
         if !options.json {
             output::print(&in_words(&checked, options.episodes))?;
         }

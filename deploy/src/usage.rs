@@ -1,10 +1,11 @@
 //! What was typed and is no command line, in one line of words.
 
-use crate::{cli::Cli, failure::Failure, output};
+use crate::{cli, failure::Failure, output};
 use clap::{
-    CommandFactory as _, Error,
+    Error,
     error::{ContextKind, ContextValue, ErrorKind},
 };
+use rit_config::program_name;
 use std::{
     io::{self, IsTerminal as _},
     process::ExitCode,
@@ -25,7 +26,9 @@ pub fn report(error: &Error) -> ExitCode {
 fn words(error: &Error, mut arguments: impl Iterator<Item = String>) -> String {
     let names = commands();
     let command = arguments.find(|argument| names.contains(argument));
-    let help = command.as_ref().map_or_else(|| "rit --help".to_owned(), |name| format!("rit {name} --help"));
+    let program = program_name();
+    let help = command.as_ref().map_or_else(String::new, |name| format!(" {name}"));
+    let help = format!("{program}{help} --help");
     let context = |kind| match error.get(kind) {
         Some(ContextValue::String(text)) => Some(text.clone()),
         Some(ContextValue::Strings(texts)) => Some(texts.join(", ")),
@@ -83,7 +86,7 @@ fn words(error: &Error, mut arguments: impl Iterator<Item = String>) -> String {
 
 /// Names of the commands.
 fn commands() -> Vec<String> {
-    Cli::command().get_subcommands().map(|command| command.get_name().to_owned()).collect()
+    cli::command().get_subcommands().map(|command| command.get_name().to_owned()).collect()
 }
 
 /// An option without what stands for its value: `--steps <N>` is `--steps`.
@@ -93,7 +96,7 @@ fn option(argument: &str) -> &str {
 
 /// The keys of the configuration that were meant, perhaps, where the command takes any; and whether they are called so.
 fn keys_meant(argument: &str, command: Option<&str>) -> (Vec<String>, bool) {
-    let root = Cli::command();
+    let root = cli::command();
     let takes_keys = command
         .and_then(|name| root.find_subcommand(name))
         .is_some_and(|command| command.get_arguments().any(|option| option.get_id() == "settings"));
@@ -117,6 +120,7 @@ fn first_paragraph(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cli::Cli;
     use clap::Parser as _;
 
     fn refused(arguments: &[&str]) -> String {
@@ -172,7 +176,7 @@ mod tests {
 
     #[test]
     fn the_name_of_any_key_is_answered_with_how_it_is_set() {
-        let command = Cli::command();
+        let command = cli::command();
         let train = command.find_subcommand("train").unwrap();
         let options: Vec<_> = train.get_arguments().filter_map(|option| option.get_long()).collect();
         let mut asked = 0;
@@ -196,6 +200,6 @@ mod tests {
 
     #[test]
     fn the_command_line_is_one_that_clap_understands() {
-        Cli::command().debug_assert();
+        cli::command().debug_assert();
     }
 }

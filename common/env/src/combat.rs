@@ -174,7 +174,7 @@ impl Environment for Combat {
         self.world.set_delays(Some(Rng::from_seed(rng.random())));
         self.look();
         let begun = self.translation.begin(&self.units, [&ally_tags, &enemy_tags]);
-        begun.map_err(|error| EnvironmentError { kind: FailureKind::BadAnswer, detail: error.to_string() })
+        begun.map_err(|error| EnvironmentError::new(FailureKind::BadAnswer, error.to_string()))
     }
 
     fn observe(&self, observation: &mut Observation) {

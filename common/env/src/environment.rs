@@ -109,6 +109,15 @@ pub struct EnvironmentError {
     pub kind: FailureKind,
     /// What happened, in words for a person.
     pub detail: String,
+    /// Where in the environment's own code, if it raised an error there: lines, as its language has them.
+    pub traceback: Option<String>,
+}
+
+impl EnvironmentError {
+    /// Without a traceback.
+    pub fn new(kind: FailureKind, detail: impl Into<String>) -> Self {
+        Self { kind, detail: detail.into(), traceback: None }
+    }
 }
 
 /// What a body is to the agents.

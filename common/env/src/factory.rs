@@ -21,6 +21,12 @@ pub trait EnvironmentFactory: Send + Sync {
     /// No world is needed for a while: what those that have ended left running may end as well.
     fn rest(&self) {}
 
+    /// Whether worlds step in processes of their own, while this one acts. A rollout then acts for half of its worlds
+    /// while the other half steps, so that neither side waits for the other.
+    fn steps_elsewhere(&self) -> bool {
+        false
+    }
+
     /// Most worlds that may play at once; embedded ones are not limited.
     fn worlds_max(&self) -> usize {
         usize::MAX

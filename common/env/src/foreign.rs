@@ -89,9 +89,9 @@ impl ForeignSet {
 impl ForeignTask {
     /// Its world.
     pub(crate) fn world(&'static self) -> Box<dyn Environment> {
-        let elsewhere = || EnvironmentError {
-            kind: FailureKind::Raised,
-            detail: format!("the world of {} is not one of this program's own", self.name),
+        let elsewhere = || {
+            let detail = format!("the world of {} is not one of this program's own", self.name);
+            EnvironmentError::new(FailureKind::Raised, detail)
         };
         let made = self.maker.ok_or_else(elsewhere).and_then(|maker| Held::make(maker, &self.name));
         match made {

@@ -242,13 +242,13 @@ impl Environment for Held {
 }
 
 fn bad(detail: String) -> EnvironmentError {
-    EnvironmentError { kind: FailureKind::BadAnswer, detail }
+    EnvironmentError::new(FailureKind::BadAnswer, detail)
 }
 
 /// What a world's own code comes to; a panic is an error of its own. After one the world is not used again.
 fn held<T>(act: impl FnOnce() -> Result<T, EnvironmentError>) -> Result<T, EnvironmentError> {
     catch_unwind(AssertUnwindSafe(act))
-        .unwrap_or_else(|panic| Err(EnvironmentError { kind: FailureKind::Raised, detail: words(&*panic) }))
+        .unwrap_or_else(|panic| Err(EnvironmentError::new(FailureKind::Raised, words(&*panic))))
 }
 
 fn words(panic: &(dyn Any + Send)) -> String {

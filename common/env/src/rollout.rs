@@ -6,7 +6,7 @@ use rit_episode::{
     Action, Choice, End, Episode, EpisodeBuilder, Exploration, Observation, Policy, Rng, RunSeed, Stream,
     Turn, decision_order,
 };
-use std::sync::Arc;
+use std::{mem, sync::Arc};
 
 /// An episode to be rolled.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -45,6 +45,7 @@ pub struct LostEpisode {
     /// Its task.
     pub task: String,
     /// Why.
+    #[source]
     pub error: EnvironmentError,
 }
 
@@ -72,6 +73,8 @@ struct Running {
     observation: Observation,
     previous_reward: f32,
     actions: Vec<Action>,
+    /// Whether its environment could be told the actions.
+    told: Result<(), EnvironmentError>,
     builder: EpisodeBuilder,
     /// Steps after which an end is the time limit's, not the task's; `None` where every end is the environment's.
     time_limit: Option<usize>,
@@ -129,7 +132,8 @@ impl Rollout {
     /// As [`Self::roll`], and shows each job's world to `watch`, under the job's index: when its episode has
     /// begun, and after each step. What was done and earned there is in the [`Episode`].
     ///
-    /// Each time, all worlds are told before the first is waited for: slow ones work side by side.
+    /// Each time, all worlds are told before the first is waited for: slow ones work side by side. Those that step in
+    /// processes of their own are told in two halves ([`EnvironmentFactory::steps_elsewhere`]).
     pub fn roll_watched(
         &mut self,
         policy: &mut dyn Policy,
@@ -147,35 +151,50 @@ impl Rollout {
             }
         }
         running.iter().for_each(|running| watch(running.slot, running.world.environment()));
-        while !running.is_empty() {
-            let mut turns: Vec<Turn<'_>> = running.iter_mut().map(Running::turn).collect();
-            policy.act(&mut turns);
-            drop(turns);
-            let told: Vec<_> =
-                running.iter_mut().map(|running| running.world.begin_step(&running.actions)).collect();
-            running = running
-                .into_iter()
-                .zip(told)
-                .filter_map(|(mut running, told)| {
-                    let stepped = told.and_then(|()| running.step());
-                    let ended = match stepped {
-                        Ok(ended) => ended,
-                        Err(error) => {
-                            rolled[running.slot] = Some(Err(self.lost(running.number, running.task, error)));
-                            return None;
-                        }
-                    };
-                    watch(running.slot, running.world.environment());
-                    let Some((end, won)) = ended else {
-                        return Some(running);
-                    };
-                    self.idle[running.task].push(running.world);
-                    rolled[running.slot] = Some(Ok(running.builder.finish(end, won)));
-                    None
-                })
-                .collect();
+        let mut groups = self.groups(running);
+        groups.iter_mut().for_each(|group| act(policy, group));
+        while groups.iter().any(|group| !group.is_empty()) {
+            for group in &mut groups {
+                self.step(group, &mut rolled, &mut watch);
+                act(policy, group);
+            }
         }
         rolled.into_iter().flatten().collect()
+    }
+
+    /// Who acts together. Worlds that share a process were begun one after another, so each process has some of both halves.
+    fn groups(&self, running: Vec<Running>) -> Vec<Vec<Running>> {
+        if !self.factory.steps_elsewhere() {
+            return vec![running];
+        }
+        let mut halves = vec![Vec::new(), Vec::new()];
+        running.into_iter().enumerate().for_each(|(at, running)| halves[at % 2].push(running));
+        halves
+    }
+
+    /// Waits for what a group's joint actions lead to; keeps those whose episodes go on.
+    fn step(
+        &mut self,
+        group: &mut Vec<Running>,
+        rolled: &mut [Option<Rolled>],
+        watch: &mut impl FnMut(usize, &dyn Environment),
+    ) {
+        for mut running in mem::take(group) {
+            let ended = match running.step() {
+                Ok(ended) => ended,
+                Err(error) => {
+                    rolled[running.slot] = Some(Err(self.lost(running.number, running.task, error)));
+                    continue;
+                }
+            };
+            watch(running.slot, running.world.environment());
+            let Some((end, won)) = ended else {
+                group.push(running);
+                continue;
+            };
+            self.idle[running.task].push(running.world);
+            rolled[running.slot] = Some(Ok(running.builder.finish(end, won)));
+        }
     }
 
     /// As [`Self::roll`]; jobs whose episodes are lost are rolled again, under their numbers.
@@ -261,7 +280,21 @@ impl Rollout {
             observation,
             previous_reward: 0.0,
             actions: vec![0; n_agents],
+            told: Ok(()),
         })
+    }
+}
+
+/// Chooses a group's joint actions, and tells them to its worlds.
+fn act(policy: &mut dyn Policy, group: &mut [Running]) {
+    if group.is_empty() {
+        return;
+    }
+    let mut turns: Vec<Turn<'_>> = group.iter_mut().map(Running::turn).collect();
+    policy.act(&mut turns);
+    drop(turns);
+    for running in group {
+        running.told = running.world.begin_step(&running.actions);
     }
 }
 
@@ -278,6 +311,7 @@ impl Running {
 
     /// Waits for what the joint action leads to; returns how the episode ended once it has.
     fn step(&mut self) -> Result<Option<(End, bool)>, EnvironmentError> {
+        mem::replace(&mut self.told, Ok(()))?;
         let step = self.world.step(&mut self.environment_rng)?;
         self.world.observe(&mut self.observation);
         self.builder.step(&self.actions, step.reward, step.shaping, &self.observation);

@@ -20,6 +20,8 @@ pub struct Broken {
     pub steps: usize,
     /// What is wrong.
     pub what: String,
+    /// Where in the environment's own code, if it raised an error there.
+    pub traceback: Option<String>,
 }
 
 /// What was seen of a task that keeps its promises.
@@ -48,9 +50,11 @@ type Course = Vec<(Observation, f32)>;
 /// The first promise that is broken.
 pub fn check(worlds: &dyn EnvironmentFactory, task: Task, episodes: u64) -> Result<Checked, Broken> {
     let begun = Instant::now();
-    let broken =
-        |episode, (steps, what): (usize, String)| Broken { task: task.to_string(), episode, steps, what };
-    let build = || worlds.build(task).map_err(|error| broken(0, (0, in_words(&error))));
+    let broken = |episode, (steps, fault): (usize, Fault)| {
+        let Fault { what, traceback } = fault;
+        Broken { task: task.to_string(), episode, steps, what, traceback }
+    };
+    let build = || worlds.build(task).map_err(|error| broken(0, (0, error.into())));
     let (mut first, mut second) = (build()?, build()?);
     let (mut steps, mut total, mut is_reproducible) = (0, 0.0, true);
     for episode in 0..episodes {
@@ -72,12 +76,25 @@ pub fn check(worlds: &dyn EnvironmentFactory, task: Task, episodes: u64) -> Resu
     })
 }
 
+/// What is wrong, and where in the environment's code.
+struct Fault {
+    what: String,
+    traceback: Option<String>,
+}
+
+impl From<EnvironmentError> for Fault {
+    fn from(EnvironmentError { kind, detail, traceback }: EnvironmentError) -> Self {
+        let kind = kind.name().trim_start_matches("environment_").replace('_', " ");
+        Self { what: format!("{kind}: {detail}"), traceback }
+    }
+}
+
 /// One episode of random available actions; or after how many steps something was wrong, and what.
-fn roll(world: &mut dyn Environment, episode: u64) -> Result<Course, (usize, String)> {
+fn roll(world: &mut dyn Environment, episode: u64) -> Result<Course, (usize, Fault)> {
     let rng = &mut SEED.stream(Stream::Environment, episode);
     let exploration = &mut SEED.stream(Stream::Exploration, episode);
     let spec = world.spec();
-    world.begin_reset(rng).and_then(|()| world.reset(rng)).map_err(|error| (0, in_words(&error)))?;
+    world.begin_reset(rng).and_then(|()| world.reset(rng)).map_err(|error| (0, error.into()))?;
     let mut course = Course::new();
     let mut reward = 0.0;
     let mut is_over = false;
@@ -91,12 +108,13 @@ fn roll(world: &mut dyn Environment, episode: u64) -> Result<Course, (usize, Str
             return Ok(course);
         }
         if steps >= spec.steps_max {
-            return Err((steps, format!("the episode does not end within steps_max = {}", spec.steps_max)));
+            let what = format!("the episode does not end within steps_max = {}", spec.steps_max);
+            return Err((steps, Fault { what, traceback: None }));
         }
         let (seen, _) = &course[steps];
         let actions: Vec<Action> = (0..spec.n_agents).map(|agent| any(seen, agent, exploration)).collect();
         let stepped = world.begin_step(&actions).and_then(|()| world.step(&actions, rng));
-        let step = stepped.map_err(|error| (steps, in_words(&error)))?;
+        let step = stepped.map_err(|error| (steps, error.into()))?;
         (reward, is_over) = (step.reward, step.end.is_some());
     }
 }
@@ -106,8 +124,4 @@ fn any(seen: &Observation, agent: usize, rng: &mut Rng) -> Action {
     let actions: Vec<Action> =
         (0..available.len()).filter(|&at| available[at] == 1).map(|at| at as Action).collect();
     actions[rng.random_range(0..actions.len())]
-}
-
-fn in_words(error: &EnvironmentError) -> String {
-    format!("{}: {error}", error.kind.name().trim_start_matches("environment_").replace('_', " "))
 }

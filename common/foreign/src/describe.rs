@@ -24,9 +24,8 @@ pub struct DescribeError {
     /// The task that was asked for.
     pub task: String,
     /// What happened.
+    #[source]
     pub error: EnvironmentError,
-    /// Where in Python, if it happened there.
-    pub traceback: Option<String>,
 }
 
 /// Asks a worker what these tasks are.
@@ -34,18 +33,11 @@ pub struct DescribeError {
 /// # Errors
 /// When Python cannot be started, or an environment cannot be made.
 pub fn describe(launch: &Launch, tasks: &[String]) -> Result<Described, DescribeError> {
-    let mut worker = Worker::start(launch).map_err(|error| DescribeError {
-        task: tasks.first().cloned().unwrap_or_default(),
-        error,
-        traceback: None,
-    })?;
+    let mut worker = Worker::start(launch)
+        .map_err(|error| DescribeError { task: tasks.first().cloned().unwrap_or_default(), error })?;
     let mut described = Vec::new();
     for task in tasks {
-        let opened = ask(&mut worker, task).map_err(|error| DescribeError {
-            task: task.clone(),
-            error,
-            traceback: worker.traceback(),
-        })?;
+        let opened = ask(&mut worker, task).map_err(|error| DescribeError { task: task.clone(), error })?;
         described.push((task.clone(), opened));
     }
     let names = |of: fn(&Opened) -> &Vec<String>| {
@@ -91,7 +83,7 @@ fn ask(worker: &mut Worker, task: &str) -> Result<Opened, EnvironmentError> {
         wrong.map(|(what, count, names)| format!("{names} names for {count} {what}"))
     };
     match fault {
-        Some(detail) => Err(EnvironmentError { kind: FailureKind::BadAnswer, detail }),
+        Some(detail) => Err(EnvironmentError::new(FailureKind::BadAnswer, detail)),
         None => Ok(*opened),
     }
 }

@@ -1,5 +1,5 @@
-//! One worker: a process that holds several environments. It has a process group of its own, so that whatever an
-//! environment has started ends with it.
+//! One worker: a process that holds several environments. It has a process group of its own, which ends with it, and a mark in
+//! its environment, by which a process that it leaves behind ends what environments have started elsewhere.
 
 use crate::protocol::{
     Answer, Failed, HEADER_BYTES, Header, Hello, PROTOCOL_VERSION, ProtocolError, Request, answer, header,
@@ -17,9 +17,12 @@ use std::{
         unix::{net::UnixStream, process::CommandExt as _},
     },
     path::{Path, PathBuf},
-    process::{Child, Command, Stdio},
-    sync::{Mutex, PoisonError},
-    time::{Duration, Instant},
+    process::{self, Child, Command, Stdio},
+    sync::{
+        Mutex, PoisonError,
+        atomic::{AtomicU64, Ordering},
+    },
+    time::{Duration, Instant, SystemTime, UNIX_EPOCH},
 };
 
 /// What the first question, which no environment answers, is about.
@@ -93,20 +96,16 @@ pub(crate) struct Worker {
     next: u16,
     /// Why it can be used no more.
     broken: Option<EnvironmentError>,
-    /// Of the last error that came from Python.
-    traceback: Option<String>,
 }
 
 impl Worker {
     /// Starts a worker and says hello; it is not waited for.
     pub(crate) fn start(launch: &Launch) -> Result<Self, EnvironmentError> {
         let interpreter = launch.interpreter();
-        let failed = |error: io::Error| EnvironmentError {
-            kind: FailureKind::Died,
-            detail: format!(
-                "{} cannot be started: {error}; set environment.interpreter",
-                interpreter.display()
-            ),
+        let failed = |error: io::Error| {
+            let interpreter = interpreter.display();
+            let detail = format!("{interpreter} cannot be started: {error}; set environment.interpreter");
+            EnvironmentError::new(FailureKind::Died, detail)
         };
         let (stream, theirs) = UnixStream::pair().map_err(failed)?;
         stream.set_read_timeout(Some(START_TIMEOUT)).map_err(failed)?;
@@ -115,6 +114,7 @@ impl Worker {
         let child = Command::new(&interpreter)
             .args(["-m", "rit.worker", &launch.make])
             .env("RIT_WORKER_MEMORY_MB", launch.memory_mb.to_string())
+            .env("RIT_WORKER_MARK", mark())
             .stdin(Stdio::from(OwnedFd::from(requests)))
             .stdout(Stdio::from(OwnedFd::from(answers)))
             .process_group(0)
@@ -131,7 +131,6 @@ impl Worker {
             environments: BTreeSet::new(),
             next: 0,
             broken: None,
-            traceback: None,
         };
         let hello = serde_json::to_vec(&Hello { protocol: PROTOCOL_VERSION }).unwrap_or_default();
         worker.send(Request::Hello, NOBODY, &hello)?;
@@ -229,22 +228,18 @@ impl Worker {
         if logged.len() < LOGGED_MAX && logged.insert(format!("{error} {place}")) {
             tracing::error!("an environment raised an error\n{traceback}");
         }
-        self.traceback = Some(traceback);
         let at = if place.is_empty() { String::new() } else { format!(" ({place})") };
-        EnvironmentError { kind: FailureKind::Raised, detail: format!("{error}{at}") }
-    }
-
-    /// The traceback of the last error that came from Python.
-    pub(crate) fn traceback(&mut self) -> Option<String> {
-        self.traceback.take()
+        EnvironmentError {
+            // Of a fault that the worker has found itself there is but a line, which the error says.
+            traceback: Some(traceback).filter(|traceback| traceback.trim_end().lines().count() > 1),
+            ..EnvironmentError::new(FailureKind::Raised, format!("{error}{at}"))
+        }
     }
 
     /// What it said cannot be understood, so nothing else that it says can be either.
     pub(crate) fn misspoke(&mut self, error: &dyn std::fmt::Display) -> EnvironmentError {
-        self.break_with(EnvironmentError {
-            kind: FailureKind::BadAnswer,
-            detail: format!("the worker's answer means nothing: {error}"),
-        })
+        let detail = format!("the worker's answer means nothing: {error}");
+        self.break_with(EnvironmentError::new(FailureKind::BadAnswer, detail))
     }
 
     fn next_frame(&mut self) -> Result<(u16, Frame), EnvironmentError> {
@@ -309,18 +304,24 @@ impl Worker {
                 ),
             ),
         };
-        self.break_with(EnvironmentError { kind, detail })
+        self.break_with(EnvironmentError::new(kind, detail))
     }
 
     fn break_with(&mut self, error: EnvironmentError) -> EnvironmentError {
         self.kill();
         // Those that share it learn what happened to it.
-        self.broken = Some(EnvironmentError {
-            kind: FailureKind::Died,
-            detail: format!("its worker was ended, since another environment in it failed: {}", error.detail),
-        });
+        let detail =
+            format!("its worker was ended, since another environment in it failed: {}", error.detail);
+        self.broken = Some(EnvironmentError::new(FailureKind::Died, detail));
         error
     }
+}
+
+/// What no other worker on this host is marked with, nor was.
+fn mark() -> String {
+    static COUNT: AtomicU64 = AtomicU64::new(0);
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    format!("{}-{}-{}", process::id(), since.as_nanos(), COUNT.fetch_add(1, Ordering::Relaxed))
 }
 
 /// Errors whose traceback was logged; one that comes again and again is logged once.

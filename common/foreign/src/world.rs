@@ -35,6 +35,10 @@ impl EnvironmentFactory for PythonWorlds {
             task.spec(),
         )))
     }
+
+    fn steps_elsewhere(&self) -> bool {
+        true
+    }
 }
 
 /// A world in a worker.
@@ -118,7 +122,7 @@ impl PythonWorld {
                 "it has {n_agents} agents and {n_entities} entities now, and had {} and {} when the run began",
                 self.spec.n_agents, self.spec.n_entities
             );
-            return Err(EnvironmentError { kind: FailureKind::BadAnswer, detail });
+            return Err(EnvironmentError::new(FailureKind::BadAnswer, detail));
         }
         self.is_open = true;
         Ok(())
@@ -130,10 +134,7 @@ impl PythonWorld {
             Ok(Answer::State) => {
                 let read = read_state(body, &self.sizes, &mut self.arrived);
                 // The frame was whole, so the others in the worker are sound.
-                read.map_err(|error| EnvironmentError {
-                    kind: FailureKind::BadAnswer,
-                    detail: error.to_string(),
-                })
+                read.map_err(|error| EnvironmentError::new(FailureKind::BadAnswer, error.to_string()))
             }
             Ok(Answer::Failed(failed)) => Err(worker.raised(*failed)),
             Ok(_) => Err(worker.misspoke(&"it did not send a state")),

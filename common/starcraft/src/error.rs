@@ -153,6 +153,6 @@ impl From<StarCraftError> for EnvironmentError {
             | StarCraftError::EnemyControl { .. }
             | StarCraftError::Task { .. } => FailureKind::Raised,
         };
-        Self { kind, detail: error.to_string() }
+        Self::new(kind, error.to_string())
     }
 }

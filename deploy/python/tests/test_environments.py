@@ -62,17 +62,21 @@ def train(path, run, *arguments, actors=1, **environment):
     return json.loads(done.stdout)
 
 
-def workers(of):
-    """Living worker processes of a run, by the folder that their environment names."""
+def of_run(of):
+    """Living processes of a run, by the folder that their environment names, with their command lines."""
     found = []
     for entry in Path("/proc").iterdir():
         try:
             if entry.name.isdigit() and f"RIT_TEST_RUN={of}".encode() in (entry / "environ").read_bytes():
-                if b"rit.worker" in (entry / "cmdline").read_bytes():
-                    found.append(int(entry.name))
+                found.append((int(entry.name), (entry / "cmdline").read_bytes()))
         except OSError:
             pass
     return found
+
+
+def workers(of):
+    """Those of them that are workers."""
+    return [pid for pid, command in of_run(of) if b"rit.worker" in command]
 
 
 def test_it_trains_and_is_as_deterministic_as_any(tmp_path):
@@ -123,7 +127,7 @@ def test_a_policy_in_python_acts_as_evaluation_does_to_the_last_bit(tmp_path):
             reward = paid
 
 
-@pytest.mark.parametrize("fault", ["raises", "hangs", "dies", "nan", "mask", "prints", "forks", "hoards"])
+@pytest.mark.parametrize("fault", ["raises", "hangs", "dies", "nan", "mask", "prints", "forks", "daemonises", "returns_twice", "hoards"])
 def test_an_episode_that_is_lost_is_rolled_again_and_changes_nothing(tmp_path, fault):
     undisturbed = train(experiment(tmp_path, training=["2"]), tmp_path / "one", "--steps", 300)
     faults = tmp_path / "faults"
@@ -135,7 +139,7 @@ def test_an_episode_that_is_lost_is_rolled_again_and_changes_nothing(tmp_path, f
     disturbed = train(path, run, "--steps", 300, *memory, RIT_TEST_FAULTS=faults, RIT_TEST_RUN=run)
     assert any(faults.iterdir())
     assert disturbed["weights_digest"] == undisturbed["weights_digest"]
-    assert workers(run) == []
+    wait_until(lambda: not of_run(run))
 
 
 @pytest.mark.parametrize(
@@ -151,6 +155,8 @@ def test_an_episode_that_is_lost_is_rolled_again_and_changes_nothing(tmp_path, f
         ("blind", "bad answer: agent 0 sees others and not itself"),
         ("nothing", "AttributeError"),
         ("hoards", "Unable to allocate 3.00 GiB"),
+        ("imaginary", "TypeError: entities has the dtype complex64; features are real numbers"),
+        ("words", "TypeError: entities has the dtype <U32; features are real numbers"),
     ],
 )
 def test_a_broken_promise_is_said_in_words(tmp_path, fault, words):
@@ -159,6 +165,25 @@ def test_a_broken_promise_is_said_in_words(tmp_path, fault, words):
     done = rit("env", "check", path, "--tasks", f"{fault}-2", *memory, check=False)
     assert done.returncode == 1 and f"task {fault}-2, episode 0, after 2 steps: " in done.stderr, done.stderr
     assert words in done.stderr
+    # Where the environment's own code raised it, and only there.
+    assert ("| RuntimeError: the bridge is out" in done.stderr) == (fault == "raises")
+
+
+def test_one_that_hangs_is_the_one_that_is_named(tmp_path):
+    """Its neighbours in the worker have answered; and it hangs before anything was waited for."""
+    path = experiment(tmp_path, training=["2"], timeout_ms=1500)
+    begun = time.monotonic()
+    done = rit("env", "check", path, "--tasks", "stuck-2", check=False)
+    assert "task stuck-2, episode 0, after 0 steps: timed out: it did not answer within" in done.stderr, done.stderr
+    assert time.monotonic() - begun < 60, "a worker that is up is not waited for as if it came up"
+
+
+def test_a_slow_neighbour_makes_nobody_late(tmp_path):
+    """Three steps of 0.4 s each are in time, where each may take 0.9 s."""
+    path = experiment(tmp_path, training=["slow-2"], timeout_ms=900)
+    settings = ("--set", "algorithm.n_rollout_threads=3", "--set", "evaluation.episodes=1")
+    assert train(path, tmp_path / "run", "--steps", 36, *settings)["ended"] == "finished"
+    assert "is lost" not in (tmp_path / "run/logs/actor-0.log").read_text()
 
 
 def test_what_keeps_its_promises_is_told_so(tmp_path):
@@ -216,15 +241,20 @@ def test_an_actor_whose_environments_always_fail_ends_the_run_once_the_limit_is_
     assert done.returncode == 1
     assert "2 times in a row every episode was lost, the last: " in done.stderr, done.stderr
     assert "RuntimeError: the bridge is out (" in done.stderr and "worlds.py" in done.stderr
+    shown = [line for line in done.stderr.splitlines() if line.startswith("| ")]
+    assert shown[0] == "| Traceback (most recent call last):" and shown[-1] == "| RuntimeError: the bridge is out", shown
+    assert done.stderr.count("Traceback") == 1
     assert "is restarted" not in done.stderr
     log = (run / "logs/actor-0.log").read_text()
-    assert log.count("Traceback (most recent call last)") == 1, log
+    assert log.count("\nTraceback (most recent call last)") == 1, "while it went on"
+    assert log.count("| Traceback (most recent call last)") == 1, "at its end"
     assert json.loads((run / "summary.json").read_text())["ended"] == "failed"
 
 
 def test_no_worker_outlives_a_run_whatever_dies(tmp_path):
     run = tmp_path / "run"
-    command = [RIT, "train", experiment(tmp_path), "--run-dir", run, "--actors", 2, "--steps", "10M"]
+    path = experiment(tmp_path, training=["2", "leaves-3"])
+    command = [RIT, "train", path, "--run-dir", run, "--actors", 2, "--steps", "10M"]
     environment = {**os.environ, "RIT_TEST_RUN": str(run)}
     training = subprocess.Popen(
         list(map(str, command)), env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
@@ -239,7 +269,7 @@ def test_no_worker_outlives_a_run_whatever_dies(tmp_path):
         wait_until(lambda: len(workers(run)) >= 2)
         for pid in [training.pid, *children(training.pid)]:
             os.kill(pid, signal.SIGKILL)
-        wait_until(lambda: not workers(run))
+        wait_until(lambda: not of_run(run))
     finally:
         training.kill()
         training.wait()

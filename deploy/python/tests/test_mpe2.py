@@ -40,7 +40,7 @@ def spread(tmp_path, monkeypatch):
 
 def test_it_keeps_its_promises(spread):
     done = rit("env", "check", "spread.toml", "--episodes", 2)
-    assert "4: 4 agents, 8 entities, 5 features, 5 actions, at most 25 steps" in done.stdout
+    assert "4: 4 agents, 8 entities, 6 features, 5 actions, at most 25 steps" in done.stdout
     assert "does NOT" not in done.stdout
 
 

@@ -1,6 +1,7 @@
 """Environments that tests train on, and some that break their promises. Imported by workers from the tests' folder."""
 
 import os
+import subprocess
 import time
 from pathlib import Path
 
@@ -42,6 +43,24 @@ class Gather(EntityEnv):
         available = np.ones((self.n_agents, 3), np.uint8)
         available[self.places[:-1] == -3, 0] = 0
         return State(features, available=available)
+
+
+class Stuck(Gather):
+    """Hangs in the reset of a run."""
+
+    def reset(self, seed):
+        if seed != PROBED:
+            time.sleep(1000)
+        return super().reset(seed)
+
+
+class Slow(Gather):
+    """Takes its time."""
+
+    def step(self, actions):
+        if self.seed != PROBED:
+            time.sleep(0.4)
+        return super().step(actions)
 
 
 class Recorded(Gather):
@@ -130,6 +149,21 @@ class Faulty(Gather):
         if os.fork() == 0:
             time.sleep(1000)
 
+    def daemonises(self, step):
+        subprocess.Popen(["sleep", "1000"], start_new_session=True)
+
+    def leaves(self, step):
+        self.daemonises(step)
+
+    def returns_twice(self, step):
+        os.fork()
+
+    def imaginary(self, step):
+        step.state.entities = step.state.entities * 1j
+
+    def words(self, step):
+        step.state.entities = step.state.entities.astype(str)
+
     def forever(self, step):
         self.steps = 0
 
@@ -140,8 +174,9 @@ class Faulty(Gather):
 def make(task):
     """`2`, `3`, …: so many agents; `recorded-2`; `raises-2` and the like."""
     fault, _, count = task.rpartition("-")
-    if fault == "recorded":
-        return Recorded(int(count))
+    own = {"recorded": Recorded, "stuck": Stuck, "slow": Slow}
+    if fault in own:
+        return own[fault](int(count))
     return Faulty(int(count), fault) if fault else Gather(int(count))
 
 

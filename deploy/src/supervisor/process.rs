@@ -1,7 +1,11 @@
 //! The child processes of `rit train`: this program, executed again.
 
 use super::{Exit, Place};
-use crate::{child, last_words::last_words, logging::LogOptions};
+use crate::{
+    child,
+    last_words::{last_traceback, last_words},
+    logging::LogOptions,
+};
 use rit_config::OwnedRunDir;
 use std::{collections::BTreeMap, fs, io, path::PathBuf, process::ExitStatus};
 use tokio::{
@@ -107,6 +111,11 @@ impl<'a> Processes<'a> {
     /// Why a process ended, if its log tells.
     pub fn last_words(&self, place: Place) -> String {
         last_words(&self.log(place), self.log_begins_at.get(&place).copied().unwrap_or(0))
+    }
+
+    /// Where in an environment's code a process's last error was raised, if its log tells.
+    pub fn last_traceback(&self, place: Place) -> Option<String> {
+        last_traceback(&self.log(place), self.log_begins_at.get(&place).copied().unwrap_or(0))
     }
 
     fn log(&self, place: Place) -> PathBuf {

@@ -2,7 +2,8 @@
 
 use super::{Effect, Event, Exit, Hung, Outcome, Place, Standing, Supervisor, process::Processes};
 use crate::{
-    control, logging::LogOptions, progress::Progress, report::printable, shutdown, warnings::Warnings,
+    control, logging::LogOptions, progress::Progress, report::printable, shutdown, traceback::marked,
+    warnings::Warnings,
 };
 use rit_config::{OwnedRunDir, RunDir};
 use rit_learner::life;
@@ -11,7 +12,13 @@ use rit_proto::{
     v1::{RunState, RunStatus, StatusRequest, StopRequest, control_client::ControlClient},
 };
 use rit_record::Summary;
-use std::{collections::VecDeque, fs, io::ErrorKind, pin::Pin, time::Duration};
+use std::{
+    collections::{BTreeSet, VecDeque},
+    fs,
+    io::ErrorKind,
+    pin::Pin,
+    time::Duration,
+};
 use tokio::time::Instant;
 
 /// From one look for the learner's address to the next.
@@ -51,6 +58,7 @@ pub async fn watch_over(
         contact: Box::pin(std::future::pending()),
         web_url: None,
         is_gone: false,
+        tracebacks: BTreeSet::new(),
     };
     let interrupted = shutdown::requested(supervised);
     tokio::pin!(interrupted);
@@ -96,6 +104,8 @@ struct Shell<'a> {
     web_url: Option<String>,
     /// The run directory was not there at the last look.
     is_gone: bool,
+    /// Those that were shown.
+    tracebacks: BTreeSet<String>,
 }
 
 impl Shell<'_> {
@@ -141,7 +151,18 @@ impl Shell<'_> {
             self.control = None;
             self.contact = Box::pin(std::future::pending());
         }
+        self.say_traceback(place);
         Event::Ended { place, exit, last_words: self.processes.last_words(place) }
+    }
+
+    /// Shows where in an environment's code a process's last error was raised, each place once: what is said of the end
+    /// is a line.
+    fn say_traceback(&mut self, place: Place) {
+        if let Some(traceback) = self.processes.last_traceback(place)
+            && self.tracebacks.insert(traceback.clone())
+        {
+            self.progress.say(&marked(&traceback));
+        }
     }
 
     fn contacted(&mut self, contacted: Contacted) -> Event {

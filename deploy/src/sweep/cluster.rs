@@ -2,7 +2,7 @@
 //! it is started again.
 
 use crate::failure::Failure;
-use rit_config::read_text;
+use rit_config::{program_name, read_text};
 use rit_record::Sweep;
 use std::path::{Path, PathBuf};
 
@@ -76,10 +76,11 @@ pub fn slurm(job: &Job) -> String {
     let Job { cells, at_once, .. } = job;
     let at_once = at_once.map_or_else(String::new, |at_once| format!("%{at_once}"));
     let (name, file, dir) = (job.name(), quoted(&job.file), quoted(&job.dir));
+    let program = program_name();
     format!(
         r#"#!/bin/bash
 # {cells} runs of a sweep, each by its index in the array: sbatch THIS-FILE. A job that is requeued, or started again, goes
-# on with its run from the newest checkpoint; one whose run is finished ends at once. `rit sweep status` in DIR shows how
+# on with its run from the newest checkpoint; one whose run is finished ends at once. `{program} sweep status` in DIR shows how
 # all stand. The folder lies on a file system that all nodes see and that can hold a Unix socket.
 #SBATCH --job-name={name}
 #SBATCH --array=0-{last}{at_once}
@@ -91,7 +92,7 @@ pub fn slurm(job: &Job) -> String {
 #SBATCH --open-mode=append
 #SBATCH --output={name}-%A_%a.log
 set -uo pipefail
-rit=${{RIT:-rit}}
+rit=${{RIT:-{program}}}
 file={file}
 dir={dir}
 
@@ -168,7 +169,7 @@ pub fn kubernetes(job: &Job) -> Result<String, Failure> {
         r#"# {cells} runs of a sweep, each by its pod's index: kubectl apply -f THIS-FILE. A pod that is replaced goes on with its
 # run from the newest checkpoint; one whose run is finished ends at once. With suspend: true the job waits, and pods that
 # run write their checkpoints and go: kubectl patch job rit-{name} -p '{{"spec":{{"suspend":true}}}}'. A queue of Kueue does so by
-# itself (`rit sweep … --queue NAME`).
+# itself (`{program} sweep … --queue NAME`).
 apiVersion: v1
 kind: ConfigMap
 metadata:
@@ -228,7 +229,7 @@ spec:
       containers:
         - name: run
           image: rit:{version}
-          command: ["rit", "sweep", "/sweep/sweep.toml", "--dir", "/runs/{name}"]
+          command: [{program:?}, "sweep", "/sweep/sweep.toml", "--dir", "/runs/{name}"]
           # Kubernetes says the index.
           args: ["--cell", "$(JOB_COMPLETION_INDEX)"]
           securityContext:
@@ -259,5 +260,6 @@ spec:
           emptyDir: {{ medium: Memory, sizeLimit: 64Mi }}
 "#,
         version = env!("CARGO_PKG_VERSION"),
+        program = program_name(),
     ))
 }

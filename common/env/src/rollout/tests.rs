@@ -118,7 +118,7 @@ impl Environment for Brittle {
 
     fn step(&mut self, actions: &[Action], rng: &mut Rng) -> Result<Step, EnvironmentError> {
         if self.steps.fetch_add(1, Ordering::Relaxed) % self.fails_every == self.fails_every - 1 {
-            return Err(EnvironmentError { kind: FailureKind::Died, detail: "it broke".into() });
+            return Err(EnvironmentError::new(FailureKind::Died, "it broke"));
         }
         self.game.step(actions, rng)
     }
@@ -192,4 +192,81 @@ fn options_reach_the_environments() {
         }
         assert_eq!(episodes[0].steps(), 25);
     }
+}
+
+/// A matrix game that says how many of its kind are under way.
+struct Counted {
+    game: MatrixGame,
+    under_way: Arc<AtomicUsize>,
+}
+
+impl Environment for Counted {
+    fn spec(&self) -> Spec {
+        MatrixGame::SPEC
+    }
+
+    fn reset(&mut self, rng: &mut Rng) -> Result<(), EnvironmentError> {
+        self.game.reset(rng)
+    }
+
+    fn observe(&self, observation: &mut Observation) {
+        self.game.observe(observation);
+    }
+
+    fn begin_step(&mut self, _: &[Action]) -> Result<(), EnvironmentError> {
+        self.under_way.fetch_add(1, Ordering::Relaxed);
+        Ok(())
+    }
+
+    fn step(&mut self, actions: &[Action], rng: &mut Rng) -> Result<Step, EnvironmentError> {
+        self.under_way.fetch_sub(1, Ordering::Relaxed);
+        self.game.step(actions, rng)
+    }
+}
+
+struct CountedWorlds {
+    under_way: Arc<AtomicUsize>,
+    steps_elsewhere: bool,
+}
+
+impl EnvironmentFactory for CountedWorlds {
+    fn build(&self, task: Task) -> Result<Box<dyn Environment>, EnvironmentError> {
+        let Task::MatrixGame { game } = task else { panic!("{task} is no matrix game") };
+        Ok(Box::new(Counted { game: MatrixGame::new(game), under_way: Arc::clone(&self.under_way) }))
+    }
+
+    fn steps_elsewhere(&self) -> bool {
+        self.steps_elsewhere
+    }
+}
+
+/// Notes at each of its turns for how many it chooses, and how many worlds are under way meanwhile.
+struct Noting(Arc<AtomicUsize>, Vec<(usize, usize)>);
+
+impl Policy for Noting {
+    fn begin(&mut self, _: usize, _: usize) {}
+
+    fn act(&mut self, turns: &mut [Turn<'_>]) {
+        self.1.push((turns.len(), self.0.load(Ordering::Relaxed)));
+        Fixed([0, 2]).act(turns);
+    }
+}
+
+#[test]
+fn worlds_elsewhere_step_while_the_policy_acts_and_episodes_are_the_same() {
+    let jobs = jobs(0..5);
+    let roll = |steps_elsewhere| {
+        let under_way = Arc::<AtomicUsize>::default();
+        let worlds = CountedWorlds { under_way: Arc::clone(&under_way), steps_elsewhere };
+        let tasks = TaskSet::MatrixGame.tasks(Split::Training);
+        let mut rollout = Rollout::new(tasks, Arc::new(worlds), RunSeed(3), true);
+        let mut noting = Noting(under_way, Vec::new());
+        (all_rolled(rollout.roll(&mut noting, &jobs)).unwrap(), noting.1)
+    };
+    let (episodes, noted) = roll(false);
+    assert_eq!(noted, [(5, 0), (5, 0)], "two steps an episode");
+    let (in_halves, noted) = roll(true);
+    assert_eq!(noted, [(3, 0), (2, 3), (3, 2), (2, 3)]);
+    assert_eq!(in_halves, episodes);
+    assert_eq!(all_rolled(rollout(3, true).roll(&mut Fixed([0, 2]), &jobs)).unwrap(), episodes);
 }

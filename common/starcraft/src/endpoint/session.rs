@@ -77,7 +77,7 @@ impl Session {
         let (id, answer) = match Request::decode(message) {
             Ok(Request { request: Some(request), id }) => (id, self.request(request)),
             Ok(Request { request: None, id }) => {
-                (id, Err("no request that this endpoint knows; see rit starcraft-endpoint --help".into()))
+                (id, Err("no request that this endpoint knows; see `rit starcraft-endpoint --help`".into()))
             }
             Err(error) => (None, Err(format!("no message of StarCraft II: {error}"))),
         };

@@ -50,6 +50,24 @@ fn it_trains_evaluates_and_lists_its_own_tasks() {
 }
 
 #[test]
+fn help_and_messages_name_this_program() {
+    for (arguments, words) in [
+        (&["train", "--help"][..], "Usage: corridor train"),
+        (&["train", "--help"], "Name of an experiment (see `corridor experiments`)"),
+        (&["sweep", "--help"], "# a name of `corridor experiments`, or a .toml file"),
+        (&["train"], "error: <EXPERIMENT> is missing; `corridor train --help` explains it"),
+        (&["train", "corridors"], "did you mean corridor? `corridor experiments` lists them"),
+        (&["experiments"], "`corridor train EXPERIMENT --algorithm NAME`"),
+        (&["ctl", "--run", "/nowhere", "status"], "/nowhere"),
+        (&["completions", "bash"], "complete -F _corridor"),
+    ] {
+        let said = said(&corridor(arguments));
+        assert!(said.contains(words), "{arguments:?}: {said}");
+        assert!(!said.contains("`rit "), "{arguments:?}: {said}");
+    }
+}
+
+#[test]
 fn a_task_that_is_none_is_refused() {
     let refused = corridor(&["train", "corridor", "--set", "environment.training_tasks=[\"corridor-1\"]"]);
     assert_eq!(refused.status.code(), Some(2));

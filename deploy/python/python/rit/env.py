@@ -13,7 +13,7 @@ An experiment names a function that makes them::
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +22,7 @@ import numpy as np
 __all__ = ["EntityEnv", "ParallelAdapter", "State", "Step"]
 
 
-@dataclass
+@dataclass(slots=True)
 class State:
     """What there is at a step."""
 
@@ -35,7 +35,7 @@ class State:
     available: np.ndarray | None = None
 
 
-@dataclass
+@dataclass(slots=True)
 class Step:
     """What a joint action led to."""
 
@@ -157,6 +157,8 @@ class ParallelAdapter(EntityEnv):
         for row, count in enumerate(self._n_actions_of):
             self._own_actions[row, :count] = 1
         self._are_alike = min(self._n_actions_of) == self.n_actions and not any(self._first_action_of)
+        self._arrays, self._shapes = [np.ndarray] * self.n_agents, [(width,) for width in self._widths]
+        self._places = [(row, slice(width)) for row, width in enumerate(self._widths)]
         if entities is None:
             # Features that no observation has: of agents that are not there, and of those that are.
             self._absent = np.zeros((self.n_agents, self.n_features), np.float32)
@@ -171,13 +173,17 @@ class ParallelAdapter(EntityEnv):
         return self._state(observations, infos)
 
     def step(self, actions: np.ndarray) -> Step:
+        return self._take(actions.tolist())
+
+    def _take(self, actions: Sequence[int]) -> Step:
+        """As :meth:`step`."""
         alive = self.env.agents
         if self._are_alike and len(alive) == self.n_agents:
-            joint = dict(zip(self._possible, actions.tolist()))
+            joint = dict(zip(self._possible, actions))
         else:
             joint = {
                 agent: action + first
-                for agent, action, first in zip(self._possible, actions.tolist(), self._first_action_of)
+                for agent, action, first in zip(self._possible, actions, self._first_action_of)
                 if agent in alive
             }
         observations, rewards, terminations, truncations, infos = self.env.step(joint)
@@ -200,12 +206,32 @@ class ParallelAdapter(EntityEnv):
         self, observations: Mapping[Any, Any], infos: Mapping[Any, Any], cut: Collection[Any] = ()
     ) -> State:
         agents = self.env.agents
-        alive = [agent in observations and (agent in agents or agent in cut) for agent in self._possible]
+        if type(agents) is list and agents == self._possible and all(map(observations.__contains__, agents)):
+            # What most steps are: everyone is there.
+            rows = [observations[agent] for agent in agents]
+            if list(map(type, rows)) == self._arrays and not any(infos.values()):
+                return self._state_of_all(observations, rows)
+            alive = [True] * len(agents)
+        else:
+            alive = [agent in observations and (agent in agents or agent in cut) for agent in self._possible]
         if self._entities is None:
             entities = self._own_features(observations, alive)
         else:
             entities = self._entities(self.env, observations)
         return State(entities, self._observable(alive), self._available(observations, infos, alive))
+
+    def _state_of_all(self, observations: Mapping[Any, Any], rows: list[np.ndarray]) -> State:
+        """As :meth:`_state`, where all agents are there, see arrays, and none has an action mask."""
+        if self._entities is not None:
+            entities = self._entities(self.env, observations)
+        elif [row.shape for row in rows] == self._shapes:
+            entities = self._present.copy()
+            for place, row in zip(self._places, rows):
+                entities[place] = row
+        else:
+            entities = self._own_features(observations, [True] * self.n_agents)
+        observable = None if self._sees == "all" else self._observable([True] * self.n_agents)
+        return State(entities, observable, None if self._are_alike else self._own_actions)
 
     def _own_features(self, observations: Mapping[Any, Any], alive: list[bool]) -> np.ndarray:
         entities = (self._present if all(alive) else self._absent).copy()
