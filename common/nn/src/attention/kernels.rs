@@ -196,7 +196,11 @@ impl<'a> Sides<'a> {
 
 /// The picked rows one after another, for products that want them so.
 fn gathered((view, picked): (View<'_>, Picked<'_>)) -> Vec<f32> {
-    (0..picked.len).flat_map(|key| view.row(picked.row(key))).copied().collect()
+    let mut rows = Vec::with_capacity(picked.len * view.cols);
+    for key in 0..picked.len {
+        rows.extend_from_slice(view.row(picked.row(key)));
+    }
+    rows
 }
 
 /// One group's keys and values, (keys, a) each.
@@ -284,11 +288,16 @@ fn blend(pairs: &[f32], (b, picked): (View<'_>, Picked<'_>), mut a: ViewMut<'_>)
         return matmul::dy_w(pairs, View::dense(&gathered((b, picked)), b.cols), a, Accum::Replace);
     }
     for (query, weights) in pairs.chunks_exact(keys).enumerate() {
-        let a = a.row(query);
-        for_lanes!(0..b.cols, |at, len| {
+        let (a, row) = (a.row(query), |key| b.row(picked.row(key)));
+        let wide = b.cols - b.cols % WIDE;
+        for at in (0..wide).step_by(WIDE) {
+            let sums: [Lanes; WIDE / LANES] = weighted_sums(weights.iter(), row, at);
+            a[at..at + WIDE].copy_from_slice(sums.as_flattened());
+        }
+        for_lanes!(wide..b.cols, |at, len| {
             let mut sum = [0.0; LANES];
             for (key, &weight) in weights.iter().enumerate() {
-                let x = load(b.row(picked.row(key)), at, len);
+                let x = load(row(key), at, len);
                 sum = each(|lane| weight.mul_add(x[lane], sum[lane]));
             }
             store(sum, a, at, len);
@@ -307,7 +316,15 @@ fn blend_transposed(pairs: &[f32], a: View<'_>, picked: Picked<'_>, mut b: ViewM
     }
     for key in 0..keys {
         let b = b.row(picked.row(key));
-        for_lanes!(0..a.cols, |at, len| {
+        let wide = a.cols - a.cols % WIDE;
+        for at in (0..wide).step_by(WIDE) {
+            let weights = pairs[key..].iter().step_by(keys);
+            let sums: [Lanes; WIDE / LANES] = weighted_sums(weights, |query| a.row(query), at);
+            for (b, sum) in b[at..at + WIDE].iter_mut().zip(sums.as_flattened()) {
+                *b = if adds { *b + sum } else { *sum };
+            }
+        }
+        for_lanes!(wide..a.cols, |at, len| {
             let sum = weighted_sum(&pairs[key..], keys, a, at, len);
             if adds {
                 let before = load(b, at, len);
@@ -317,6 +334,26 @@ fn blend_transposed(pairs: &[f32], a: View<'_>, picked: Picked<'_>, mut b: ViewM
             }
         });
     }
+}
+
+/// Columns that are summed side by side: one sum waits for its own last addition.
+const WIDE: usize = 4 * LANES;
+
+/// Σ weight i · row i, in the columns from `at` on: N times [`LANES`] of them.
+#[inline(always)]
+fn weighted_sums<'r, 'w, const N: usize>(
+    weights: impl Iterator<Item = &'w f32>,
+    row: impl Fn(usize) -> &'r [f32],
+    at: usize,
+) -> [Lanes; N] {
+    let mut sums = [[0.0; LANES]; N];
+    for (i, &weight) in weights.enumerate() {
+        let (row, _) = row(i)[at..at + N * LANES].as_chunks::<LANES>();
+        for (sum, x) in sums.iter_mut().zip(row) {
+            *sum = each(|lane| weight.mul_add(x[lane], sum[lane]));
+        }
+    }
+    sums
 }
 
 /// Σ weights[i · stride] · row i, in the `len` columns from `at` on.
@@ -336,4 +373,44 @@ pub(crate) fn take<'a>(rest: &mut &'a mut [f32], len: usize) -> &'a mut [f32] {
     let (front, back) = std::mem::take(rest).split_at_mut(len);
     *rest = back;
     front
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gradcheck::noise;
+
+    /// Every sum adds its products one after another, however many columns are worked on at once.
+    #[test]
+    fn blends_are_sums_of_weighted_rows_at_any_width() {
+        let (queries, keys) = (LARGE - 1, 5);
+        let rows = [4, 0, 3, 1, 2];
+        for cols in [6, LANES, WIDE, WIDE + 6, 2 * WIDE + LANES] {
+            let (pairs, b) = (noise(1, queries * keys), noise(2, keys * cols));
+            let picked = Picked { first: 0, len: keys, rows: Some(&rows) };
+            let mut a = vec![9.0; queries * cols];
+            blend(&pairs, (View::dense(&b, cols), picked), ViewMut::dense(&mut a, cols));
+            for (at, &found) in a.iter().enumerate() {
+                let (query, column) = (at / cols, at % cols);
+                let expected = (0..keys).fold(0.0, |sum: f32, key| {
+                    pairs[query * keys + key].mul_add(b[rows[key] * cols + column], sum)
+                });
+                assert_eq!(found, expected, "query {query}, column {column} of {cols}");
+            }
+            for adds in [false, true] {
+                let mut back = vec![0.5; keys * cols];
+                let to = ViewMut::dense(&mut back, cols);
+                blend_transposed(&pairs, View::dense(&a, cols), picked, to, adds);
+                for key in 0..keys {
+                    for column in 0..cols {
+                        let sum = (0..queries).fold(0.0, |sum: f32, query| {
+                            pairs[query * keys + key].mul_add(a[query * cols + column], sum)
+                        });
+                        let expected = if adds { 0.5 + sum } else { sum };
+                        assert_eq!(back[rows[key] * cols + column], expected, "key {key}, column {column}");
+                    }
+                }
+            }
+        }
+    }
 }
