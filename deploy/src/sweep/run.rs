@@ -1,7 +1,6 @@
 //! Runs the cells of a sweep on this machine, several side by side.
 
 use super::{
-    log,
     plan::{self, Plan},
     screen::Screen,
     standing::{self, Standing, State},

@@ -1,6 +1,6 @@
 //! How the cells of a sweep stand, and what is left to do.
 
-use super::{costs::Costs, log, plan::Plan};
+use super::{costs::Costs, plan::Plan};
 use crate::report;
 use rit_config::{Config, RunDir};
 use rit_record::{Cell, CellState, Ended, Progress, Record, Summary, Sweep, TaskResult, last_progress};
