@@ -5,6 +5,7 @@ use crate::{
     experiments::plain_settings,
     failure::Failure,
     new_file, output,
+    report::counted,
 };
 use rit_env::Split;
 use rit_report::{
@@ -34,7 +35,9 @@ pub fn run(options: &PlotOptions) -> Result<ExitCode, Failure> {
         }
         if run.broken_lines > 0 {
             // It is drawn without them, whether or not the warning can be printed.
-            let _ = output::say(&format!("{run}: {} torn lines are left out", run.broken_lines));
+            let are = if run.broken_lines == 1 { "is" } else { "are" };
+            let lines = counted(run.broken_lines as u64, "torn line");
+            let _ = output::say(&format!("{run}: {lines} {are} left out"));
         }
     }
     let by = input.keys_by(&options.by);

@@ -194,8 +194,8 @@ impl OwnedRunDir {
                 written.map_err(|error| RunDirError::Io { path, error })?;
             }
             // They lead to the other's learner.
-            for name in FOUND_BY {
-                remove_if_there(&root.join(name)).map_err(io)?;
+            for path in FOUND_BY.map(|name| root.join(name)) {
+                remove_if_there(&path).map_err(|error| RunDirError::Io { path, error })?;
             }
             self.run_dir = RunDir { root: root.clone(), run_id, lineage, token };
             self.notices.push(format!(
@@ -212,11 +212,13 @@ impl OwnedRunDir {
 }
 
 fn why_not_made(root: &Path, error: io::Error) -> RunDirError {
+    // A file on the way there is what the system calls existing.
+    if let Some(file) = root.ancestors().find(|path| path.is_file()) {
+        return RunDirError::NotADirectory(file.to_owned());
+    }
     match why_missing(root, error) {
         // It is to be made: that it is missing is no reason.
-        RunDirError::Missing { root, .. } => {
-            RunDirError::Io { path: root, error: ErrorKind::NotFound.into() }
-        }
+        RunDirError::Missing { root, .. } => RunDirError::NotMade(root),
         other => other,
     }
 }

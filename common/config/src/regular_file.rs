@@ -25,9 +25,17 @@ pub fn open_regular(path: &Path, options: &mut OpenOptions) -> io::Result<File> 
         Err(error) if error.raw_os_error() == Some(rustix::io::Errno::NXIO.raw_os_error()) => {
             return Err(no_file());
         }
+        Err(error) if error.kind() == ErrorKind::NotFound => return Err(leads_nowhere(path).unwrap_or(error)),
         opened => opened?,
     };
     if file.metadata()?.is_file() { Ok(file) } else { Err(no_file()) }
+}
+
+/// What is wrong with a file that is not there but for a link to it. It counts as missing all the same.
+fn leads_nowhere(path: &Path) -> Option<io::Error> {
+    let target = fs::read_link(path).ok()?;
+    let words = format!("it is a link to {}, which does not exist", target.display());
+    Some(io::Error::new(ErrorKind::NotFound, words))
 }
 
 /// The bytes of a regular file.
@@ -94,6 +102,10 @@ mod tests {
         assert_eq!(read_text(&path).unwrap(), "new");
         assert!(!folder.path().join("file.partial").exists());
         assert!(message(&folder.path().join("nothing"), 100).contains("No such file"));
+        let link = folder.path().join("link");
+        std::os::unix::fs::symlink("gone/file", &link).unwrap();
+        assert_eq!(message(&link, 100), "it is a link to gone/file, which does not exist");
+        assert_eq!(read_text(&link).unwrap_err().kind(), ErrorKind::NotFound);
         fs::write(&path, [0xff]).unwrap();
         assert_eq!(read_text(&path).unwrap_err().to_string(), "it is no UTF-8 text");
     }

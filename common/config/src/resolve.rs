@@ -2,7 +2,7 @@
 
 use crate::{
     Backend, Config, ConfigError, Environment, KeepBest, SpawnRotate, StarCraft, Until, foreign, keys,
-    method_keys,
+    method_keys, number::WHOLE_MAX,
 };
 use rit_algo::{Method, Regime};
 use rit_env::{
@@ -289,13 +289,21 @@ pub(crate) fn parse(text: &str, source_name: &str) -> Result<Table, ConfigError>
     text.parse::<Table>().map_err(|error| {
         let before = error.span().and_then(|span| text.get(..span.start)).unwrap_or_default();
         let last_line = before.rsplit('\n').next().unwrap_or_default();
+        let number = error.span().and_then(|span| text.get(span)).filter(|found| is_whole_number(found));
+        let reason = number.map(|number| format!("{number} is out of range {}..={WHOLE_MAX}", i64::MIN));
         ConfigError::Syntax {
             source_name: source_name.to_owned(),
             line: before.matches('\n').count() + 1,
             column: last_line.chars().count() + 1,
-            reason: one_line(&error),
+            reason: reason.unwrap_or_else(|| one_line(&error)),
         }
     })
+}
+
+/// Whether this is a whole number, though it may have too many digits for one.
+fn is_whole_number(text: &str) -> bool {
+    let digits = text.strip_prefix(['+', '-']).unwrap_or(text);
+    !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit() || byte == b'_')
 }
 
 fn one_line(error: &toml::de::Error) -> String {

@@ -74,6 +74,9 @@ pub enum RunDirError {
     /// A file, where a directory belongs.
     #[error("{0} is a file and no directory; choose another, or move it away")]
     NotADirectory(PathBuf),
+    /// A file system that takes no folder there, as /proc.
+    #[error("{0} cannot be made: the system takes no folder there; choose another --run-dir")]
+    NotMade(PathBuf),
     /// A relative path, and nothing that it is relative to.
     #[error("the current folder, from which {0} is meant, has been deleted; change to one that exists")]
     CurrentFolderDeleted(PathBuf),
@@ -287,7 +290,9 @@ pub(crate) fn utf8(path: &Path) -> Result<(), RunDirError> {
 pub(crate) fn read_config(root: &Path) -> Result<String, RunDirError> {
     let path = root.join(CONFIG);
     read_text(&path).map_err(|error| match error.kind() {
-        ErrorKind::NotFound => RunDirError::Missing { root: root.to_owned(), why: "it has no config.toml" },
+        ErrorKind::NotFound if !path.is_symlink() => {
+            RunDirError::Missing { root: root.to_owned(), why: "it has no config.toml" }
+        }
         _ => RunDirError::Io { path, error },
     })
 }

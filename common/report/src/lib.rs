@@ -147,8 +147,8 @@ pub fn read_by(
 ) -> Result<Input, ReportError> {
     let mut input = Input::default();
     for (at, path) in paths.iter().enumerate() {
-        if paths[..at].contains(path) {
-            let [first, second] = [0; 2].map(|_| path.display().to_string());
+        if let Some(first) = paths[..at].iter().find(|first| *first == path) {
+            let [first, second] = [first, path].map(|path| path.display().to_string());
             return Err(ReportError::Twice { first, second, seed: None });
         }
     }

@@ -200,6 +200,34 @@ fn a_copy_gets_an_identity_of_its_own_and_keeps_its_files_lineage() {
 }
 
 #[test]
+fn what_lies_in_the_place_of_a_file_is_named() {
+    let (folder, root) = folder();
+    OwnedRunDir::create(&root, &config()).unwrap();
+    let other = folder.path().join("other");
+    copy(&root, &other);
+    fs::create_dir(other.join("web")).unwrap();
+    let wrong = OwnedRunDir::resume(&other, &[]).unwrap_err().to_string();
+    assert!(wrong.contains("other/web: Is a directory"), "{wrong}");
+    fs::remove_file(root.join("config.toml")).unwrap();
+    std::os::unix::fs::symlink("gone.toml", root.join("config.toml")).unwrap();
+    let wrong = OwnedRunDir::resume(&root, &[]).unwrap_err().to_string();
+    assert!(wrong.contains("config.toml: it is a link to gone.toml, which does not exist"), "{wrong}");
+
+    let file = folder.path().join("file");
+    fs::write(&file, "").unwrap();
+    for (place, words) in [
+        (file.join("run"), "file is a file and no directory"),
+        (file.join("deep/run"), "file is a file and no directory"),
+        (PathBuf::from("/proc/run"), "/proc/run cannot be made"),
+    ] {
+        let wrong = OwnedRunDir::create(&place, &config()).unwrap_err().to_string();
+        assert!(wrong.contains(words), "{wrong}");
+        let wrong = OwnedRunDir::create_fresh(&place, "run", &config()).unwrap_err().to_string();
+        assert!(wrong.contains(words), "{wrong}");
+    }
+}
+
+#[test]
 fn a_run_that_was_moved_stays_what_it_was() {
     let (folder, root) = folder();
     let made = OwnedRunDir::create(&root, &config()).unwrap().run_dir().clone();

@@ -140,6 +140,10 @@ fn errors_name_the_key_and_the_remedy() {
         refused(&["environment.task_set=chess"]).contains("unknown task set \"chess\"; known: matrix-game")
     );
     assert!(refused_file("").contains("names no environment.task_set"));
+    assert_eq!(
+        refused_file(&format!("{MATRIX}\nseed = 9223372036854775808")),
+        "my.toml, line 2, column 8: 9223372036854775808 is out of range -9223372036854775808..=9223372036854775807"
+    );
 }
 
 #[test]
