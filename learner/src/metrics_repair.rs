@@ -51,6 +51,8 @@ impl Any {
 struct Lines {
     /// Where whole lines lie.
     whole: Vec<Range<u64>>,
+    /// Whether the first of them is the header.
+    has_header: bool,
     /// Lines among them that cannot be read.
     broken: usize,
     /// Environment steps of the last whole one.
@@ -77,8 +79,12 @@ impl Lines {
             let range = at..at + read;
             at = range.end;
             if range.start == 0 && is_header(&line) && line.ends_with(b"\n") {
-                header.check(&serde_json::from_slice(&line).map_err(io::Error::from)?)?;
-                lines.whole.push(range);
+                // One that cannot be read is written anew, as one that is missing.
+                if let Ok(found) = serde_json::from_slice(&line) {
+                    header.check(&found)?;
+                    lines.has_header = true;
+                    lines.whole.push(range);
+                }
                 continue;
             }
             match serde_json::from_slice::<Any>(&line) {
@@ -93,6 +99,18 @@ impl Lines {
                 }
                 _ => broken_since += 1,
             }
+        }
+    }
+
+    /// What was done about those that are not whole.
+    fn words(&self) -> String {
+        let header = "its first line, which says whose it is, is written anew";
+        let are = if self.broken == 1 { "is" } else { "are" };
+        let broken = format!("{} of its lines cannot be read and {are} left out", self.broken);
+        match (self.has_header, self.broken) {
+            (true, _) => broken,
+            (false, 0) => header.to_owned(),
+            (false, _) => format!("{header}, {broken}"),
         }
     }
 
@@ -125,13 +143,12 @@ pub fn repair(path: &Path, header: &Header, end: End) -> Result<(u64, Option<Str
     });
     let (len, last) = (lines.len(), lines.last);
     let path_shown = path.display();
-    if !lines.are_the_beginning() {
-        let damaged = rewrite(path, &lines.whole)?;
-        let (broken, damaged) = (lines.broken, damaged.display());
-        let warning = format!(
-            "{path_shown}: {broken} of its lines cannot be read and are left out; as it was, it lies in {damaged}"
-        );
-        return Ok((len, Some(warning)));
+    let is_headless = len > 0 && !lines.has_header;
+    if is_headless || !lines.are_the_beginning() {
+        let first = if is_headless { header.line()? } else { Vec::new() };
+        let damaged = rewrite(path, &first, &lines.whole)?;
+        let warning = format!("{path_shown}: {}; as it was, it lies in {}", lines.words(), damaged.display());
+        return Ok((first.len() as u64 + len, Some(warning)));
     }
     let file = open_regular(path, OpenOptions::new().write(true))?;
     file.set_len(len)?;
@@ -145,8 +162,8 @@ pub fn repair(path: &Path, header: &Header, end: End) -> Result<(u64, Option<Str
     Ok((len, warning))
 }
 
-/// Writes the file anew, of these ranges; keeps the old one beside it. Returns where.
-fn rewrite(path: &Path, ranges: &[Range<u64>]) -> io::Result<PathBuf> {
+/// Writes the file anew, of a first line and these ranges; keeps the old one beside it. Returns where.
+fn rewrite(path: &Path, first: &[u8], ranges: &[Range<u64>]) -> io::Result<PathBuf> {
     let numbers = std::iter::once(String::new()).chain((2..100).map(|number| format!("-{number}")));
     let mut places = numbers.map(|number| path.with_extension(format!("jsonl.damaged{number}")));
     let damaged = places.find(|place| fs::symlink_metadata(place).is_err());
@@ -155,6 +172,7 @@ fn rewrite(path: &Path, ranges: &[Range<u64>]) -> io::Result<PathBuf> {
     let mut options = OpenOptions::new();
     let mut to = open_regular(&partial, options.write(true).create(true).truncate(true).mode(0o600))?;
     let mut from = open_regular(path, OpenOptions::new().read(true))?;
+    to.write_all(first)?;
     for range in ranges {
         from.seek(SeekFrom::Start(range.start))?;
         io::copy(&mut io::Read::take(&mut from, range.end - range.start), &mut to)?;
@@ -252,7 +270,26 @@ mod tests {
         let zeros = whole().replace(&line(10), "\0\0\0\n");
         let (left, warning) = repaired(&zeros);
         assert_eq!(left, format!("{RUN}\n{}{}", line(0), line(20)));
-        assert!(warning.unwrap().contains("1 of its lines cannot be read and are left out"));
+        assert!(warning.unwrap().contains("1 of its lines cannot be read and is left out"));
+    }
+
+    #[test]
+    fn a_first_line_that_is_torn_or_gone_is_written_anew() {
+        let kept = whole()[..end().len as usize].to_owned();
+        let header = String::from_utf8(Header::of("ab".into(), None).line().unwrap()).unwrap();
+        let lines = &kept[RUN.len() + 1..];
+        // Gone, torn, with a byte that is no text in it, and no longer to be known for a header.
+        for (first, broken) in [
+            (String::new(), ""),
+            (format!("{}\n", &RUN[..30]), ""),
+            (format!("{}\n", RUN.replace("ab", "a\0")), ""),
+            (format!("\0\0{}\n", &RUN[2..]), ", 1 of its lines cannot be read and is left out"),
+        ] {
+            let (left, warning) = repaired(&format!("{first}{lines}"));
+            assert_eq!(left, header.clone() + lines, "{first:?}");
+            let words = format!("its first line, which says whose it is, is written anew{broken}; as it was");
+            assert!(warning.as_ref().unwrap().contains(&words), "{warning:?}");
+        }
     }
 
     #[test]

@@ -43,6 +43,14 @@ pub enum ReplayLogError {
         /// What is wrong with it.
         rejection: Rejection,
     },
+    /// The file was cut short.
+    #[error("{path}: it ends before episode {number}, which was written to it")]
+    Short {
+        /// The file.
+        path: PathBuf,
+        /// The episode.
+        number: u64,
+    },
     /// A frame of another episode.
     #[error("{path}: episode {found} lies where {expected} should")]
     OutOfOrder {
@@ -58,7 +66,7 @@ pub enum ReplayLogError {
 /// What a person can do about a failed write.
 pub(crate) fn remedy(error: &io::Error) -> &'static str {
     match error.kind() {
-        ErrorKind::StorageFull | ErrorKind::QuotaExceeded => "; free some space, training goes on meanwhile",
+        ErrorKind::StorageFull | ErrorKind::QuotaExceeded => "; free some space",
         ErrorKind::ReadOnlyFilesystem | ErrorKind::PermissionDenied => {
             "; make the run directory writable again"
         }
@@ -221,7 +229,10 @@ pub fn read(folder: &Path, expected: &Expected, numbers: Range<u64>) -> Result<V
         let read = reader
             .read_exact(bytemuck::bytes_of_mut::<Header>(&mut header))
             .and_then(|()| reader.read_exact(&mut payload));
-        read.map_err(|error| ReplayLogError::Io { path: path.clone(), error })?;
+        read.map_err(|error| match (error.kind(), path.clone()) {
+            (ErrorKind::UnexpectedEof, path) => ReplayLogError::Short { path, number },
+            (_, path) => ReplayLogError::Io { path, error },
+        })?;
         let episode = wire::decode(&header, &payload, expected)
             .map_err(|rejection| ReplayLogError::Frame { path: path.clone(), number, rejection })?;
         if episode.number != number {
@@ -359,7 +370,7 @@ mod tests {
         assert!(error(&altered).contains("episode 3: the frame's checksum"));
         let swapped = [&good[frame..2 * frame], &good[..frame], &good[2 * frame..]].concat();
         assert!(error(&swapped).contains("episode 1 lies where 0 should"));
-        assert!(error(&good[..good.len() - 1]).contains("failed to fill whole buffer"));
+        assert!(error(&good[..good.len() - 1]).contains("it ends before episode 9"));
         // Frames of another build are of another length.
         let mut old = [&good[..frame - 8], &good[frame..]].concat();
         old[8] -= 1;
