@@ -33,6 +33,14 @@ pub fn requested(supervised: bool) -> impl Future<Output = ()> {
     }
 }
 
+/// Where SIGHUP is ignored, as under `nohup`, all that this process starts would ignore it too. A process that catches a
+/// signal hands its default action down; this one goes on when it comes.
+pub fn hand_hangups_down() {
+    if ignores(SignalKind::hangup()) {
+        drop(caught(SignalKind::hangup()));
+    }
+}
+
 /// Catches a signal; where that does not go, it ends the process by itself.
 fn caught(kind: SignalKind) -> Option<Signal> {
     signal(kind).ok()

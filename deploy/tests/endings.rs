@@ -93,6 +93,17 @@ fn a_terminal_that_closes_ends_a_run_in_order_and_nohup_keeps_it() {
     assert_eq!(train.wait().status.code(), Some(130));
 }
 
+/// Started with SIGHUP ignored, the test above waited for ever.
+#[test]
+fn a_terminal_that_closes_is_tested_under_nohup_too() {
+    let mut tests = Command::new("timeout");
+    tests.args(["110", "nohup"]).arg(std::env::current_exe().unwrap()).stdin(Stdio::null());
+    tests.args(["--exact", "a_terminal_that_closes_ends_a_run_in_order_and_nohup_keeps_it"]);
+    let output = tests.output().unwrap();
+    let stdout = String::from_utf8_lossy(&output.stdout);
+    assert!(output.status.success() && stdout.contains("1 passed"), "{:?} {stdout}", output.status);
+}
+
 #[test]
 fn a_run_whose_directory_is_removed_says_so_before_it_ends() {
     let folder = RunFolder::new();

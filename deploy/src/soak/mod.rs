@@ -5,7 +5,7 @@ mod fire;
 mod schedule;
 mod simulated;
 
-use crate::{cli::SoakOptions, experiments, failure::Failure, output};
+use crate::{cli::SoakOptions, experiments, failure::Failure, output, shutdown};
 use fire::{Dealt, Run};
 use rit_config::RunDir;
 use rit_episode::{Episode, wire::Expected};
@@ -58,6 +58,8 @@ pub async fn run(options: SoakOptions) -> Result<ExitCode, Failure> {
             "{folder} exists; choose another --dir, or move it away"
         )));
     }
+    // Among the blows are hang-ups.
+    shutdown::hand_hangups_down();
     // What is wrong with the experiment is said before anything is made.
     let mut settings = options.settings.clone();
     settings.extend(experiments::algorithm(options.algorithm.as_deref()));

@@ -8,15 +8,39 @@ use std::{
     os::unix::fs::PermissionsExt as _,
     path::{Path, PathBuf},
     process::{Child, Command, Output, Stdio},
+    sync::LazyLock,
     time::{Duration, Instant},
 };
 use tempfile::TempDir;
+use tokio::{
+    runtime::Runtime,
+    signal::unix::{SignalKind, signal},
+};
 
 /// Far beyond what any step of a test takes on a slow machine: reached only when something hangs.
 const DEADLINE: Duration = Duration::from_secs(120);
 
+/// Signals that these tests were started with ignored, as by `nohup` or in the background of a script: what they start
+/// would ignore them too. A process that catches a signal hands its default action down.
+static CAUGHT: LazyLock<Runtime> = LazyLock::new(|| {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().unwrap();
+    let inside = runtime.enter();
+    let status = fs::read_to_string("/proc/self/status").unwrap();
+    let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:")).unwrap();
+    let ignored = u64::from_str_radix(ignored.trim(), 16).unwrap();
+    for kind in [SignalKind::hangup(), SignalKind::quit()] {
+        // Signals are counted from 1.
+        if ignored >> (kind.as_raw_value() - 1) & 1 == 1 {
+            drop(signal(kind).unwrap());
+        }
+    }
+    drop(inside);
+    runtime
+});
+
 /// `rit` with these arguments.
 pub fn rit(arguments: &[&str]) -> Command {
+    LazyLock::force(&CAUGHT);
     let mut command = Command::new(env!("CARGO_BIN_EXE_rit"));
     command.args(arguments).stdin(Stdio::null());
     command
