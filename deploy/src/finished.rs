@@ -62,7 +62,7 @@ impl Finished {
     /// Why it failed, if it did, after this.
     fn reason(&self, after: &str) -> String {
         let reason = self.summary.reason.as_deref();
-        reason.map_or_else(String::new, |reason| report::printable(&format!("{after}{reason}")))
+        reason.map_or_else(String::new, |reason| report::printable_sentence(&format!("{after}{reason}")))
     }
 
     fn figures(&self) -> String {

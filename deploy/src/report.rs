@@ -134,9 +134,17 @@ pub fn words(name: &str) -> String {
 /// Text from outside, such as an actor's name, as a terminal may be shown it: on one line, no longer than a line, and
 /// without the characters that steer a terminal.
 pub fn printable(text: &str) -> String {
-    const LEN_MAX: usize = 200;
+    shown(text, 200)
+}
+
+/// The same of a sentence, such as a warning: paths in it are long, and its end says what can be done.
+pub fn printable_sentence(text: &str) -> String {
+    shown(text, 2000)
+}
+
+fn shown(text: &str, chars_max: usize) -> String {
     let shown: String =
-        text.chars().take(LEN_MAX).map(|c| if c.is_control() { '\u{fffd}' } else { c }).collect();
+        text.chars().take(chars_max).map(|c| if c.is_control() { '\u{fffd}' } else { c }).collect();
     if shown.chars().count() < text.chars().count() { shown + "…" } else { shown }
 }
 
@@ -208,6 +216,8 @@ mod tests {
         assert_eq!(printable("actor-0"), "actor-0");
         assert_eq!(printable("a\u{1b}[31m\nb\u{9b}c"), "a\u{fffd}[31m\u{fffd}b\u{fffd}c");
         assert_eq!(printable(&"ä".repeat(60_000)).chars().count(), 201);
+        assert_eq!(printable_sentence(&"ä".repeat(60_000)).chars().count(), 2001);
+        assert_eq!(printable_sentence("a\u{1b}[31m\nb"), "a\u{fffd}[31m\u{fffd}b");
     }
 
     #[test]

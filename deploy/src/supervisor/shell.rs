@@ -2,8 +2,8 @@
 
 use super::{Effect, Event, Exit, Hung, Outcome, Place, Standing, Supervisor, process::Processes};
 use crate::{
-    control, logging::LogOptions, progress::Progress, report::printable, shutdown, traceback::marked,
-    warnings::Warnings,
+    control, logging::LogOptions, progress::Progress, report::printable_sentence, shutdown,
+    traceback::marked, warnings::Warnings,
 };
 use rit_config::{OwnedRunDir, RunDir};
 use rit_learner::life;
@@ -191,7 +191,7 @@ impl Shell<'_> {
 
     fn say_warnings(&self, warnings: &[String]) {
         for warning in warnings {
-            self.progress.say(&format!("warning: {}", printable(warning)));
+            self.progress.say(&format!("warning: {}", printable_sentence(warning)));
         }
     }
 

@@ -133,7 +133,7 @@ async fn all(dir: &Path, plan: &Plan, options: &SweepOptions) -> Result<ExitCode
     let outcome = run::run_all(dir, plan, share, options.retry, options.json).await?;
     print(&standing::of_all(dir, plan), options.json)?;
     for (cell, why) in outcome.failed.iter().chain(&outcome.left) {
-        let _ = output::say(&format!("{cell}: {}", crate::report::printable(why)));
+        let _ = output::say(&format!("{cell}: {}", crate::report::printable_sentence(why)));
     }
     Ok(match outcome {
         run::Outcome { interrupted: true, .. } => ExitCode::from(130),

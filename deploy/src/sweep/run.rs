@@ -235,7 +235,7 @@ impl Jobs<'_> {
                 format!("failed: {why}")
             }
         };
-        self.screen.say(&format!("{name}: {}", report::printable(&words)));
+        self.screen.say(&format!("{name}: {}", report::printable_sentence(&words)));
     }
 
     /// Shows how the cells that run stand, a line each.
