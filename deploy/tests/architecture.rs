@@ -83,7 +83,7 @@ fn code(folder: &str) -> BTreeMap<String, Vec<String>> {
     assert!(!found.is_empty(), "{folder} is where it was");
     let read = |path: PathBuf| {
         let text = fs::read_to_string(&path).unwrap();
-        let text = text.split("#[cfg(test)]\nmod tests").next().unwrap();
+        let text = text.split("#[cfg(test)]\nmod tests {").next().unwrap();
         let lines = text.lines().filter(|line| !line.trim_start().starts_with("//"));
         let name = path.strip_prefix(root()).unwrap().display().to_string();
         (name, lines.map(str::to_owned).collect())
@@ -126,6 +126,35 @@ fn environments_and_networks_and_algorithms_know_no_transport() {
         let found = holding(code(&format!("{folder}/src")), &io);
         assert!(found.is_empty(), "{found:?} reads files, sockets or clocks");
     }
+}
+
+#[test]
+fn machines_that_decide_know_no_clock_file_socket_or_process() {
+    // Around them are their shells, and in the simulator a world of models.
+    let code: BTreeMap<_, _> = code("deploy/src").into_iter().chain(code("learner/src")).collect();
+    let shells = [
+        "deploy/src/supervisor/process.rs",
+        "deploy/src/supervisor/shell.rs",
+        "learner/src/coordinator/shell.rs",
+    ];
+    let machines = ["deploy/src/supervisor", "learner/src/coordinator", "learner/src/ledger"];
+    let decides =
+        |name: &str| machines.iter().any(|machine| name.starts_with(machine)) && !shells.contains(&name);
+    let machines: BTreeMap<_, _> = code.into_iter().filter(|(name, _)| decides(name)).collect();
+    assert!(machines.len() > 10, "they are where they were: {:?}", machines.keys());
+    let effects = [
+        "Instant",
+        "SystemTime",
+        "fs::",
+        "std::io",
+        "std::net",
+        "tokio",
+        "Command::new",
+        "thread::",
+        "std::env",
+    ];
+    let found = holding(machines, &effects);
+    assert!(found.is_empty(), "{found:?} does what is a shell's");
 }
 
 #[test]
