@@ -209,7 +209,7 @@ fn what_lies_in_the_place_of_a_file_is_named() {
     let wrong = OwnedRunDir::resume(&other, &[]).unwrap_err().to_string();
     assert!(wrong.contains("other/web: Is a directory"), "{wrong}");
     fs::remove_file(root.join("config.toml")).unwrap();
-    std::os::unix::fs::symlink("gone.toml", root.join("config.toml")).unwrap();
+    symlink("gone.toml", root.join("config.toml")).unwrap();
     let wrong = OwnedRunDir::resume(&root, &[]).unwrap_err().to_string();
     assert!(wrong.contains("config.toml: it is a link to gone.toml, which does not exist"), "{wrong}");
 
