@@ -147,11 +147,30 @@ fn is_alive(pid: u32) -> bool {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
+    use std::sync::{PoisonError, RwLock, RwLockReadGuard};
+
+    /// A process that is being started holds what this one holds until it has become another program. Tests that take a
+    /// lock again which they have just given up let no other test start one meanwhile.
+    static STARTING: RwLock<()> = RwLock::new(());
+
+    /// While it lives, tests of this process start none.
+    pub(crate) type NoProcessStarts = RwLockReadGuard<'static, ()>;
+
+    pub(crate) fn no_process_starts() -> NoProcessStarts {
+        STARTING.read().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// A process that ends at once.
+    fn start() -> process::Child {
+        let _alone = STARTING.write().unwrap_or_else(PoisonError::into_inner);
+        process::Command::new("true").spawn().unwrap()
+    }
 
     #[test]
     fn one_at_a_time_and_the_other_is_named() {
+        let _no_process_starts = no_process_starts();
         let folder = tempfile::tempdir().unwrap();
         let lock = RunLock::take(folder.path()).unwrap();
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0, "taking it makes nothing");
@@ -185,7 +204,7 @@ mod tests {
     #[test]
     fn the_processes_of_a_first_that_has_died_are_waited_for() {
         let folder = tempfile::tempdir().unwrap();
-        let mut first = process::Command::new("true").spawn().unwrap();
+        let mut first = start();
         let dead = first.id();
         first.wait().unwrap();
         let lock = RunLock::take(folder.path()).unwrap();
@@ -199,7 +218,7 @@ mod tests {
 
     #[test]
     fn a_zombie_does_not_run() {
-        let mut child = process::Command::new("true").spawn().unwrap();
+        let mut child = start();
         assert!(is_alive(process::id()));
         // Ended, and not waited for.
         while is_alive(child.id()) {

@@ -1,20 +1,45 @@
 use super::*;
 use crate::resolve;
-use std::{os::unix::fs::symlink, process::Command, sync::Barrier, thread};
+use crate::run_lock::tests::{NoProcessStarts, no_process_starts};
+use std::{os::unix::fs::symlink, sync::Barrier, thread};
 use tempfile::TempDir;
 
 fn config() -> Config {
     resolve("environment.task_set = \"matrix-game\"\nseed = 5", "test", &[]).unwrap()
 }
 
-fn folder() -> (TempDir, PathBuf) {
-    let folder = tempfile::tempdir().unwrap();
+/// A place for runs, whose locks are free as soon as they are given up.
+struct Folder {
+    place: TempDir,
+    _no_process_starts: NoProcessStarts,
+}
+
+impl Folder {
+    fn path(&self) -> &Path {
+        self.place.path()
+    }
+}
+
+fn folder() -> (Folder, PathBuf) {
+    let folder = Folder { place: tempfile::tempdir().unwrap(), _no_process_starts: no_process_starts() };
     let root = folder.path().join("run");
     (folder, root)
 }
 
+/// As `cp -a` copies a folder.
 fn copy(from: &Path, to: &Path) {
-    assert!(Command::new("cp").arg("-a").args([from, to]).status().unwrap().success());
+    fs::create_dir(to).unwrap();
+    fs::set_permissions(to, fs::metadata(from).unwrap().permissions()).unwrap();
+    for entry in fs::read_dir(from).unwrap() {
+        let (entry, to) = entry.map(|entry| (entry.path(), to.join(entry.file_name()))).unwrap();
+        if let Ok(target) = fs::read_link(&entry) {
+            symlink(target, to).unwrap();
+        } else if entry.is_dir() {
+            copy(&entry, &to);
+        } else {
+            fs::copy(&entry, &to).unwrap();
+        }
+    }
 }
 
 /// Every file below a folder with what it holds, but for the lock's, which names the process that looked last.
