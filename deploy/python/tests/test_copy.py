@@ -209,3 +209,22 @@ def test_wrong_keys_are_said(server, run, monkeypatch, capsys):
     assert copied(run, "s3://bucket/runs/two", "--once") == 1
     assert "warning: not copied" in capsys.readouterr().err
     assert not any(path.is_file() for path in Path(server.folder / "bucket").rglob("*"))
+
+
+def test_it_copies_although_what_it_says_is_not_read(run, tmp_path):
+    reads, writes = os.pipe()
+    os.close(reads)
+    with open(writes, "wb") as closed:
+        command = [sys.executable, "-m", "rit.copy", "--run", run, "--to", f"file://{tmp_path}/store"]
+        copying = subprocess.run(command, stdout=closed, stderr=subprocess.PIPE, timeout=60)
+    assert (copying.returncode, copying.stderr) == (0, b"")
+    assert any(name.startswith("checkpoints/") for name in stored(tmp_path / "store"))
+
+
+def test_a_list_that_cannot_be_read_is_named(run, tmp_path, capsys):
+    url = f"file://{tmp_path}/store"
+    assert copied(run, url) == 0
+    (listed,) = (tmp_path / "store" / "checkpoints").iterdir()
+    listed.write_text("[]")
+    assert copied(run, url) == 1
+    assert f"{listed.name} cannot be read" in capsys.readouterr().err

@@ -23,7 +23,9 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+from rit._command import Failed, run_command, say, warn
 
 FORMAT_VERSION = 1
 #: Where lists of files, and files, lie below the prefix.
@@ -39,10 +41,6 @@ DIGEST = re.compile(r"[0-9a-f]{64}")
 #: No list is longer, and no file.
 LIST_MAX, FILE_MAX = 1 << 24, 1 << 36
 FIRST_WAIT_S, WAIT_MAX_S = 0.5, 30.0
-
-
-class Failed(Exception):
-    """What cannot be done, in words."""
 
 
 class Passing(Exception):
@@ -105,7 +103,7 @@ class Copier:
         self.lists = store.names(LISTS)
         self.there = store.names(FILES)
         if self.lists:
-            theirs = json.loads(store.get(f"{LISTS}/{max(self.lists)}", LIST_MAX))["run_id"]
+            theirs = _listed(store, max(self.lists)).run_id
             if theirs != self.run_id:
                 raise Failed(f"{store.url} holds copies of another run ({theirs}); choose another prefix")
 
@@ -161,11 +159,30 @@ class Copier:
             self.lists.discard(name)
         wanted: set[str] = set()
         for name in self.lists:
-            listed = json.loads(self.store.get(f"{LISTS}/{name}", LIST_MAX))
-            wanted |= {file["sha256"] for file in listed["files"]}
+            wanted |= {digest for _, _, digest in _listed(self.store, name).files}
         for digest in self.there - wanted:
             self.store.delete(f"{FILES}/{digest}")
             self.there.discard(digest)
+
+
+class Listed(NamedTuple):
+    """What a copy's list says."""
+
+    run_id: str
+    checkpoint: str
+    format_version: int
+    #: Place in the run directory, bytes, SHA-256.
+    files: list[tuple[str, int, str]]
+
+
+def _listed(store: Store, name: str) -> Listed:
+    text = store.get(f"{LISTS}/{name}", LIST_MAX)
+    try:
+        said = json.loads(text)
+        files = [(file["path"], int(file["bytes"]), file["sha256"]) for file in said["files"]]
+        return Listed(said["run_id"], said["checkpoint"], said["format_version"], files)
+    except (ValueError, KeyError, TypeError) as error:
+        raise Failed(f"{store.url}/{LISTS}/{name} cannot be read ({error!r})") from None
 
 
 class Patience:
@@ -196,7 +213,7 @@ def follow(run: Path, url: str, keep: int, once: bool, every_s: float, patience_
             step = copier.newest()
             if step is not None and (step, ended) != done:
                 sent = copier.copy(step, ended)
-                print(f"{step} copied, {sent} bytes sent", flush=True)
+                say(f"{step} copied, {sent} bytes sent")
                 done = (step, ended)
             patience = None
         except Passing as error:
@@ -204,7 +221,7 @@ def follow(run: Path, url: str, keep: int, once: bool, every_s: float, patience_
             if patience.waits():
                 continue
             failures += 1
-            print(f"warning: not copied ({failures} so far): {error}", file=sys.stderr, flush=True)
+            warn(f"warning: not copied ({failures} so far): {error}")
             patience = None
             if ended or once:
                 raise Failed("the newest checkpoint was not copied") from None
@@ -225,17 +242,12 @@ def fetch(url: str, run: Path, at: int | None, patience_s: float) -> str:
         try:
             return _fetch(store, name, run, patience_s)
         except Failed as error:
-            print(f"warning: {error}; the one before is tried", file=sys.stderr, flush=True)
+            warn(f"warning: {error}; the one before is tried")
     raise Failed(f"{url} holds no {'copy that is whole' if names else 'copy' if at is None else f'copy of step {at}'}")
 
 
 def _fetch(store: Store, name: str, run: Path, patience_s: float) -> str:
-    try:
-        listed = json.loads(_again(patience_s, lambda: store.get(f"{LISTS}/{name}", LIST_MAX)))
-        files = [(file["path"], int(file["bytes"]), file["sha256"]) for file in listed["files"]]
-        step, version = listed["checkpoint"], listed["format_version"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise Failed(f"{store.url}/{LISTS}/{name} cannot be read ({error!r})") from None
+    run_id, step, version, files = _again(patience_s, lambda: _listed(store, name))
     if version != FORMAT_VERSION or f"{step}.json" != name:
         raise Failed(f"{store.url}/{LISTS}/{name}: format {version} of {step}; this package knows format {FORMAT_VERSION}")
     for path, size, digest in files:
@@ -249,7 +261,7 @@ def _fetch(store: Store, name: str, run: Path, patience_s: float) -> str:
                 raise Failed(f"{store.url}/{FILES}/{digest} ({path} of {step}) was altered")
             _write(folder / path, content)
         os.symlink(step, folder / "checkpoints" / "latest")
-        known = {"format_version": 1, "run_id": listed["run_id"], "newest": step}
+        known = {"format_version": 1, "run_id": run_id, "newest": step}
         _write(folder / "checkpoints.json", json.dumps(known, indent=2).encode())
         # The run's own was not copied: it opens doors.
         _write(folder / "token", f"{secrets.token_hex(16)}\n".encode())
@@ -303,22 +315,19 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.keep < 1:
         parser.error(f"--keep {options.keep}: at least 1")
-    try:
-        if options.source is not None:
-            if options.run.exists():
-                parser.error(f"--run {options.run} is there already; name a new folder")
+    if options.source is not None and options.run.exists():
+        parser.error(f"--run {options.run} is there already; name a new folder")
+    if options.source is None and not options.run.is_dir():
+        parser.error(f"--run {options.run}: there is no such folder")
+
+    def copy() -> None:
+        if options.source is None:
+            follow(options.run, options.to, options.keep, options.once, max(options.every, 0.1), options.patience)
+        else:
             step = fetch(options.source, options.run, options.at, options.patience)
-            print(f"{step} fetched; `rit train --resume {options.run}` goes on")
-            return 0
-        if not options.run.is_dir():
-            parser.error(f"--run {options.run}: there is no such folder")
-        follow(options.run, options.to, options.keep, options.once, max(options.every, 0.1), options.patience)
-    except Failed as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 130
-    return 0
+            say(f"{step} fetched; `rit train --resume {options.run}` goes on")
+
+    return run_command(copy)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from rit._command import Failed, run_command, say
+
 #: How the program says a run ended, and what MLflow calls that.
 STATUS = {"finished": "FINISHED", "until": "FINISHED", "stopped": "KILLED", "interrupted": "KILLED", "failed": "FAILED"}
 #: The most that one request takes.
@@ -29,10 +31,6 @@ METRICS_MAX, PARAMS_MAX, VALUE_MAX = 1000, 100, 6000
 #: The tag by which a run is found again, and how far it has been copied.
 RUN_ID, COPIED = "rit.run_id", "rit.copied_env_steps"
 PROGRESS = ("kind", "env_steps", "episodes", "updates", "wall_s", "epsilon", "tasks")
-
-
-class Failed(Exception):
-    """What cannot be done, in words."""
 
 
 class Server:
@@ -190,7 +188,7 @@ def follow(run: Path, server: Server, experiment: str, once: bool, every_s: floa
         for header in (line for line in new if line.get("kind") == "run"):
             if copy is None:
                 copy = Copy(server, experiment, run, header)
-                print(copy.page, flush=True)
+                say(copy.page)
         if copy is None and (once or summary):
             raise Failed(f"{run}/metrics.jsonl does not say whose it is: there is no run, or an older build wrote it")
         if copy is not None:
@@ -199,7 +197,7 @@ def follow(run: Path, server: Server, experiment: str, once: bool, every_s: floa
             if summary:
                 copy.end(summary)
             if summary or once:
-                print(f"{sent} lines copied; the run {'has ended: ' + summary['ended'] if summary else 'goes on'}")
+                say(f"{sent} lines copied; the run {'has ended: ' + summary['ended'] if summary else 'goes on'}")
                 return
         time.sleep(every_s)
 
@@ -224,15 +222,12 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"--uri {options.uri}: write http://HOST:PORT")
     if not options.run.is_dir():
         parser.error(f"--run {options.run}: there is no such folder")
-    try:
+
+    def copy() -> None:
         server = Server(options.uri, options.patience)
         follow(options.run, server, options.experiment, options.once, max(options.every, 0.1))
-    except Failed as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 130
-    return 0
+
+    return run_command(copy)
 
 
 if __name__ == "__main__":

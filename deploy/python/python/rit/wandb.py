@@ -12,7 +12,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from rit.mlflow import Failed, Lines, scalars
+from rit._command import Failed, run_command, say
+from rit.mlflow import Lines, scalars
 
 
 def write(run: Path, folder: Path, project: str) -> str:
@@ -65,13 +66,12 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if not options.run.is_dir():
         parser.error(f"--run {options.run}: there is no such folder")
-    try:
+
+    def write_down() -> None:
         place = write(options.run, options.dir, options.project)
-    except Failed as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    print(f"`wandb sync {place}` uploads it")
-    return 0
+        say(f"`wandb sync {place}` uploads it")
+
+    return run_command(write_down)
 
 
 if __name__ == "__main__":
