@@ -1,12 +1,8 @@
 //! What a process that ended said last: why it ended, if its log tells.
 
 use crate::traceback;
-use rit_config::open_regular;
-use std::{
-    fs::OpenOptions,
-    io::{self, Read as _, Seek as _, SeekFrom},
-    path::Path,
-};
+use rit_config::read_tail;
+use std::path::Path;
 
 /// Bytes of a log, from its end, that are looked through.
 const TAIL: u64 = 64 << 10;
@@ -14,7 +10,7 @@ const TAIL: u64 = 64 << 10;
 /// Why the process that writes this log ended, as far as it said. `begins_at` is the log's length when it started: what
 /// lies before is of others.
 pub fn last_words(log: &Path, begins_at: u64) -> String {
-    match tail(log, begins_at) {
+    match read_tail(log, begins_at, TAIL) {
         Ok(text) => in_text(&text),
         Err(error) => format!("its log cannot be read: {error}"),
     }
@@ -22,20 +18,11 @@ pub fn last_words(log: &Path, begins_at: u64) -> String {
 
 /// The traceback of an environment that stands before the process's last error, without its marks.
 pub fn last_traceback(log: &Path, begins_at: u64) -> Option<String> {
-    let text = tail(log, begins_at).ok()?;
+    let text = read_tail(log, begins_at, TAIL).ok()?;
     let lines: Vec<&str> = text.lines().collect();
     let at = lines.iter().rposition(|line| line.starts_with("error: "))?;
     let lines: Vec<&str> = traceback::before(&lines[..at]).into_iter().map(traceback::unmarked).collect();
     (!lines.is_empty()).then(|| lines.join("\n"))
-}
-
-fn tail(log: &Path, begins_at: u64) -> io::Result<String> {
-    let mut bytes = Vec::new();
-    let mut file = open_regular(log, OpenOptions::new().read(true))?;
-    let from = file.metadata()?.len().saturating_sub(TAIL).max(begins_at);
-    file.seek(SeekFrom::Start(from))?;
-    file.take(TAIL).read_to_end(&mut bytes)?;
-    Ok(String::from_utf8_lossy(&bytes).into_owned())
 }
 
 /// The last error; a panic's message; else the last line that is no report of success.

@@ -3,7 +3,7 @@
 use rustix::fs::OFlags;
 use std::{
     fs::{self, File, OpenOptions},
-    io::{self, ErrorKind, Read as _, Write as _},
+    io::{self, ErrorKind, Read as _, Seek as _, SeekFrom, Write as _},
     os::unix::fs::OpenOptionsExt as _,
     path::Path,
 };
@@ -62,6 +62,20 @@ pub fn read_text(path: &Path) -> io::Result<String> {
         .map_err(|_| io::Error::new(ErrorKind::InvalidData, "it is no UTF-8 text"))
 }
 
+/// The end of a regular file that others write text to, such as a log: at most so many bytes, none of those before
+/// `begins_at`. What is no UTF-8 is replaced.
+///
+/// # Errors
+/// When it is no regular file, or cannot be read.
+pub fn read_tail(path: &Path, begins_at: u64, bytes_max: u64) -> io::Result<String> {
+    let mut file = open_regular(path, OpenOptions::new().read(true))?;
+    let from = file.metadata()?.len().saturating_sub(bytes_max).max(begins_at);
+    file.seek(SeekFrom::Start(from))?;
+    let mut bytes = Vec::new();
+    file.take(bytes_max).read_to_end(&mut bytes)?;
+    Ok(String::from_utf8_lossy(&bytes).into_owned())
+}
+
 /// Writes a file for its user alone, as a whole or not at all.
 ///
 /// # Errors
@@ -77,6 +91,17 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn of_a_log_only_the_end_is_read() {
+        let log = tempfile::NamedTempFile::new().unwrap();
+        fs::write(log.path(), b"before\nlast \xff words\n").unwrap();
+        let tail = |begins_at, bytes_max| read_tail(log.path(), begins_at, bytes_max).unwrap();
+        assert_eq!(tail(7, 100), "last \u{fffd} words\n");
+        assert_eq!(tail(0, 6), "words\n");
+        assert_eq!(tail(100, 6), "", "it was cut off meanwhile");
+        assert!(read_tail(&log.path().with_extension("gone"), 0, 6).is_err());
+    }
     use rustix::fs::Mode;
 
     #[test]

@@ -20,10 +20,8 @@ const MANIFEST: &str = "sweep.json";
 const FORMAT_VERSION: u32 = 1;
 /// No manifest is longer.
 const BYTES_MAX: u64 = 64 << 20;
-/// No log of a cell is longer.
-const LOG_BYTES_MAX: u64 = 1 << 32;
 /// Of a log's end, what is looked at for its last words, in bytes.
-const LAST_WORDS: usize = 8 << 10;
+const LAST_WORDS: u64 = 8 << 10;
 
 /// The runs of a sweep.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -122,8 +120,7 @@ impl Sweep {
 
     /// The last line of a cell's log, if it has one.
     pub fn last_words(dir: &Path, cell: &Cell) -> Option<String> {
-        let text = rit_config::read_regular(&Self::log(dir, cell), LOG_BYTES_MAX).ok()?;
-        let tail = String::from_utf8_lossy(&text[text.len().saturating_sub(LAST_WORDS)..]).into_owned();
+        let tail = rit_config::read_tail(&Self::log(dir, cell), 0, LAST_WORDS).ok()?;
         tail.lines().rev().find(|line| !line.trim().is_empty()).map(|line| line.trim().to_owned())
     }
 

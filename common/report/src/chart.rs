@@ -320,13 +320,14 @@ fn draw_curves(chart: &Chart, area: &Area) -> Drawn {
         draw_line(line, &mut plane)?;
     }
     if let Some(y) = chart.marked {
-        plane.draw_series(DashedLineSeries::new(
-            [(left, y), (right, y)],
-            6 * PIXEL,
-            4 * PIXEL,
-            GREY.stroke_width(px(1)),
-        ))?;
+        draw_dashes([(left, y), (right, y)], &mut plane)?;
     }
+    Ok(())
+}
+
+/// A thin line that is no result: what results are held against.
+fn draw_dashes(ends: [(f64, f64); 2], plane: &mut Plane) -> Drawn {
+    plane.draw_series(DashedLineSeries::new(ends, 6 * PIXEL, 4 * PIXEL, GREY.stroke_width(px(1))))?;
     Ok(())
 }
 
@@ -337,12 +338,7 @@ fn draw_scatter(scatter: &Scatter, area: &Area) -> Drawn {
     let mut plane = plane(area, &labels, [left, right], [bottom, top])?;
     let (from, to) = (left.max(bottom), right.min(top));
     if from < to {
-        plane.draw_series(DashedLineSeries::new(
-            [(from, from), (to, to)],
-            6 * PIXEL,
-            4 * PIXEL,
-            GREY.stroke_width(px(1)),
-        ))?;
+        draw_dashes([(from, from), (to, to)], &mut plane)?;
     }
     let style = scatter.key.colour().mix(0.5).filled();
     plane.draw_series(scatter.places.iter().map(|&[x, y]| Circle::new((x, y), px(2), style)))?;
@@ -404,12 +400,7 @@ fn draw_rows(chart: &Rows, area: &Area) -> Result<Vec<i32>, Box<dyn Error + Send
         .label_style(text(15))
         .draw()?;
     if let Some(line) = chart.line {
-        plane.draw_series(DashedLineSeries::new(
-            [(line, 0.0), (line, count)],
-            5 * PIXEL,
-            4 * PIXEL,
-            GREY.stroke_width(px(1)),
-        ))?;
+        draw_dashes([(line, 0.0), (line, count)], &mut plane)?;
     }
     for (at, row) in chart.rows.iter().enumerate() {
         let (y, colour) = (count - at as f64 - 0.5, row.key.colour());

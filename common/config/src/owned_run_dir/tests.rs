@@ -1,6 +1,8 @@
 use super::*;
-use crate::resolve;
-use crate::run_lock::tests::{NoProcessStarts, no_process_starts};
+use crate::{
+    resolve,
+    run_lock::tests::{NoProcessStarts, no_process_starts},
+};
 use std::{os::unix::fs::symlink, sync::Barrier, thread};
 use tempfile::TempDir;
 
