@@ -96,11 +96,13 @@ pub const fn family(task_set: TaskSet) -> &'static str {
 /// The presets between the defaults and the experiment, the lowest first: texts, and where they are from.
 pub(crate) fn presets(method: Method, task_set: TaskSet) -> Result<Vec<Table>, ConfigError> {
     let family = family(task_set);
-    let of_family = match family {
-        "matrix" => include_str!("presets/matrix.toml"),
-        "smac" => include_str!("presets/smac.toml"),
-        "foreign" => "",
-        _ => include_str!("presets/mpe.toml"),
+    let of_family = match task_set {
+        TaskSet::MatrixGame => include_str!("presets/matrix.toml"),
+        TaskSet::CooperativeNavigation | TaskSet::PredatorPrey | TaskSet::PredatorPreyPro => {
+            include_str!("presets/mpe.toml")
+        }
+        TaskSet::Combat(_) => include_str!("presets/smac.toml"),
+        TaskSet::Foreign(_) => "",
     };
     let mut of_method = parse(preset(method), "the method's preset")?;
     let mut of_both = Table::new();
