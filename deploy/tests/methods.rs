@@ -39,6 +39,24 @@ fn the_same_seed_gives_the_same_weights_with_every_method_whoever_rolls() {
     }
 }
 
+/// Padding changes nothing: frames, replay and networks have room for the largest task, be it one that is never trained on.
+/// MAPPO and MAT are left out, since the published ones read all slots, empty ones too, in one layer of their width.
+#[test]
+fn room_for_larger_teams_changes_no_weight() {
+    for method in Method::ALL.into_iter().filter(|method| method.facts().regime == Regime::Replay) {
+        let digest = |testing: &str| {
+            let mut run = run(method, "400", "1");
+            run[0] = "cooperative-navigation";
+            let testing = format!("environment.testing_tasks=[\"{testing}\"]");
+            run.extend(["--set", &testing, "--set", "evaluation.testing_episodes=1"]);
+            let summary = RunFolder::new().train(&run);
+            assert!(summary["updates"].as_u64() > Some(0), "{method}");
+            summary["weights_digest"].clone()
+        };
+        assert_eq!(digest("navigation-4-4"), digest("navigation-9-9"), "{method}");
+    }
+}
+
 /// A rival of replay's regime, and one that draws numbers of its own; `on_policy.rs` has the others.
 #[test]
 fn whoever_is_killed_the_weights_are_those_of_an_undisturbed_run() {
