@@ -3,13 +3,37 @@
 
 mod common;
 
-use common::{RunFolder, Train, output, rit};
+use common::{RunFolder, Train, kill, learner_pid, output, pids, rit, wait_until_gone};
+use rustix::process::Signal;
 use serde_json::Value;
 use std::process::Stdio;
 
 fn json(output: &std::process::Output) -> Value {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     serde_json::from_slice(&output.stdout).unwrap()
+}
+
+/// A pause is the run's, not the learner's: the learner that takes over from a killed one is paused too. Started again, the
+/// run goes on.
+#[test]
+fn a_pause_outlives_the_learner_and_not_the_run() {
+    let run = ["matrix-game", "--actors", "1", "--seed", "1", "--steps", "2000"];
+    let folder = RunFolder::new();
+    let mut train = folder.start(&run);
+    train.wait_for("training", |status| status["updates"].as_u64() > Some(10));
+    json(&train.ctl(&["pause"]));
+    let killed = learner_pid(&json(&train.ctl(&["status"])));
+    kill(killed, Signal::KILL);
+    let next = train.wait_for("the next learner and the actor", |status| {
+        learner_pid(status) != killed && !status["actors"].as_array().unwrap().is_empty()
+    });
+    assert_eq!((&next["state"], &next["ledger"]["outstanding"]), (&"paused".into(), &0.into()));
+    train.signal(Signal::KILL);
+    train.wait();
+    pids(&next).into_iter().for_each(wait_until_gone);
+    let resumed = Train::resume(&folder, &[]).finish();
+    let undisturbed = RunFolder::new().train(&run);
+    assert_eq!(resumed["weights_digest"], undisturbed["weights_digest"]);
 }
 
 #[test]

@@ -105,11 +105,11 @@ impl control_server::Control for ControlService {
     }
 
     async fn pause(&self, _: Request<v1::PauseRequest>) -> Result<Response<v1::RunStatus>, Status> {
-        Ok(Response::new(self.run.ask(Control::Pause).await?))
+        Ok(Response::new(self.run.pause().await?))
     }
 
     async fn resume(&self, _: Request<v1::ResumeRequest>) -> Result<Response<v1::RunStatus>, Status> {
-        Ok(Response::new(self.run.ask(Control::Resume).await?))
+        Ok(Response::new(self.run.resume().await?))
     }
 
     async fn stop(&self, request: Request<v1::StopRequest>) -> Result<Response<v1::RunStatus>, Status> {

@@ -3,7 +3,7 @@
 use crate::{
     checkpoint::{self, CheckpointError, Loaded},
     control_service::ControlService,
-    coordinator::{Coordinator, Event, Shell},
+    coordinator::{Control, Coordinator, Event, Shell},
     cpu_time::CpuTime,
     episodes_service::EpisodesService,
     initial::{InitialError, initial_params},
@@ -169,6 +169,11 @@ pub async fn run(
     beginning.warnings.extend(notice);
     let coordinator = Coordinator::new(config.clone(), beginning);
     let coordinator = Shell::new(coordinator, welcome, work, fences);
+    if run_dir.paused().is_file() {
+        // A pause outlives the learner that was told to. The first event in the queue: no episode is handed out before.
+        let (answer, _) = oneshot::channel();
+        let _ = events.send(Event::Control(Control::Pause(answer))).await;
+    }
 
     let stop = Arc::new(AtomicBool::new(false));
     let expected = Arc::new(expected);
@@ -237,7 +242,7 @@ pub async fn run(
         () = &mut coordinating => {}
         () = &mut shutdown => {
             let (answer, _) = oneshot::channel();
-            let _ = events.send(Event::Control(crate::coordinator::Control::Stop { drain: false, ended: Ended::Interrupted, answer })).await;
+            let _ = events.send(Event::Control(Control::Stop { drain: false, ended: Ended::Interrupted, answer })).await;
             coordinating.await;
         }
     }
@@ -254,8 +259,9 @@ pub async fn run(
     };
     let _ = tokio::time::timeout(CLOSE_TIMEOUT, closing).await;
     let _ = tokio::time::timeout(CLOSE_TIMEOUT, serving_web.join_next()).await;
-    let _ = fs::remove_file(run_dir.address());
-    let _ = fs::remove_file(run_dir.remote_address());
+    for file in [run_dir.address(), run_dir.remote_address(), run_dir.paused()] {
+        let _ = fs::remove_file(file);
+    }
     let received = receiving.await.map_err(|_| LearnerError::Panicked("receive")).flatten();
     let trained = training.await.map_err(|_| LearnerError::Panicked("train"));
     writing.await.map_err(|_| LearnerError::Panicked("write"))?;

@@ -8,13 +8,16 @@ use crate::{
     weights::{Snapshot, WeightsBoard},
 };
 use rit_algo::{Acting, Model, learner::Measure};
-use rit_config::{Config, ConfigError, RunDir, RunDirError, set, set_live};
+use rit_config::{Config, ConfigError, RunDir, RunDirError, set, set_live, write_whole};
 use rit_env::{EnvironmentFactory, Scene, TaskError, rollout::LostEpisode};
 use rit_episode::{Episode, RunSeed};
 use rit_proto::v1;
-use std::sync::{
-    Arc,
-    atomic::{AtomicBool, Ordering},
+use std::{
+    fs,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
 };
 use tokio::{
     sync::{Mutex, Semaphore, mpsc, oneshot, watch},
@@ -164,6 +167,31 @@ impl RunHandle {
         self.config.send_replace(config);
         tracing::info!(?settings, log, "settings changed");
         Ok(status)
+    }
+
+    /// Pauses the run. If this learner is killed, the next one is paused too.
+    ///
+    /// # Errors
+    /// When the run is over.
+    pub async fn pause(&self) -> Result<v1::RunStatus, AskError> {
+        let _one_at_a_time = self.setting.lock().await;
+        let status = self.ask(Control::Pause).await?;
+        // A full disk may be why somebody pauses: it does not keep them from it.
+        if let Err(error) = write_whole(&self.run_dir.paused(), b"") {
+            let path = self.run_dir.paused();
+            tracing::warn!(path = %path.display(), %error, "if the learner is killed, the next one will not be paused");
+        }
+        Ok(status)
+    }
+
+    /// Resumes a run that is paused.
+    ///
+    /// # Errors
+    /// When the run is over.
+    pub async fn resume(&self) -> Result<v1::RunStatus, AskError> {
+        let _one_at_a_time = self.setting.lock().await;
+        let _ = fs::remove_file(self.run_dir.paused());
+        self.ask(Control::Resume).await
     }
 
     /// Asks the coordinator.

@@ -234,6 +234,11 @@ impl RunDir {
         run_lock::other_host(&self.root)
     }
 
+    /// An empty file that is there while the run is paused, for the learner that takes over from a killed one.
+    pub fn paused(&self) -> PathBuf {
+        self.root.join("paused")
+    }
+
     /// Where the learner's shared memory is administered: a line of text, written anew by each learner.
     pub fn shared_memory(&self) -> PathBuf {
         self.root.join("shared_memory")

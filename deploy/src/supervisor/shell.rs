@@ -47,6 +47,8 @@ pub async fn watch_over(
     supervised: bool,
 ) -> (Outcome, bool) {
     let run_dir = owned.run_dir();
+    // Starting a run resumes it: its pause ended with the processes that were paused.
+    let _ = fs::remove_file(run_dir.paused());
     let mut shell = Shell {
         supervisor: Supervisor::new(actors, run_dir.logs().display().to_string()),
         began: Instant::now(),

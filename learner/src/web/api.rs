@@ -35,14 +35,9 @@ pub fn router() -> Router<Page> {
         .route("/api/events", get(events::events))
         .route("/api/log", get(log))
         .route("/metrics", get(prometheus))
-        .route("/api/pause", post(async |State(page)| tell(page, Control::Pause).await))
-        .route("/api/resume", post(async |State(page)| tell(page, Control::Resume).await))
-        .route(
-            "/api/stop",
-            post(async |State(page)| {
-                tell(page, |answer| Control::Stop { drain: false, ended: Ended::Stopped, answer }).await
-            }),
-        )
+        .route("/api/pause", post(pause))
+        .route("/api/resume", post(resume))
+        .route("/api/stop", post(stop))
         .route("/api/checkpoint", post(checkpoint))
         .route("/api/evaluate", post(evaluate))
         .route("/api/watch", post(watch))
@@ -157,11 +152,17 @@ async fn prometheus(State(page): State<Page>) -> Result<Response, ApiError> {
     Ok(([(header::CONTENT_TYPE, prometheus::CONTENT_TYPE)], text).into_response())
 }
 
-async fn tell(
-    page: Page,
-    what: impl FnOnce(tokio::sync::oneshot::Sender<v1::RunStatus>) -> Control,
-) -> Result<Json<v1::RunStatus>, ApiError> {
-    Ok(Json(page.handle.ask(what).await?))
+async fn pause(State(page): State<Page>) -> Result<Json<v1::RunStatus>, ApiError> {
+    Ok(Json(page.handle.pause().await?))
+}
+
+async fn resume(State(page): State<Page>) -> Result<Json<v1::RunStatus>, ApiError> {
+    Ok(Json(page.handle.resume().await?))
+}
+
+async fn stop(State(page): State<Page>) -> Result<Json<v1::RunStatus>, ApiError> {
+    let stop = |answer| Control::Stop { drain: false, ended: Ended::Stopped, answer };
+    Ok(Json(page.handle.ask(stop).await?))
 }
 
 async fn checkpoint(State(page): State<Page>) -> Result<Json<v1::CheckpointResponse>, ApiError> {
