@@ -9,6 +9,7 @@ use crate::{
 use rit_env::Split;
 use rit_record::Record;
 use rit_statistics::{generalisation_gap, mean, percentile, standard_error, t_interval};
+use std::collections::BTreeSet;
 
 /// The percentiles that say how runs vary.
 const PERCENTILES: [f64; 5] = [0.05, 0.25, 0.5, 0.75, 0.95];
@@ -79,15 +80,20 @@ fn departures(groups: &[&Group], options: &Options) -> String {
             settings(&group.task_set, "rit").unwrap_or_default()
         };
         let (plain, presets) = (of(options.plain), of(of_presets));
-        let differing: Vec<String> = plain
+        // How long a run was sets no method apart, so what came to less than the paper's runs is among the others.
+        let runs = group.methods.iter().flat_map(|method| &method.runs);
+        let lengths = runs.filter_map(|run| run.settings.get_key_value("training.t_max"));
+        let differing: BTreeSet<String> = plain
             .iter()
+            .chain(lengths)
             .filter_map(|(key, value)| {
                 Some((key, value, presets.get(key).filter(|preset| *preset != value)?))
             })
             .map(|(key, value, preset)| format!("{key} = {value} in place of {preset}"))
             .collect();
         if !differing.is_empty() {
-            words += &format!(" {}, ours: {}.", group.title, differing.join(", "));
+            let differing = Vec::from_iter(differing).join(", ");
+            words += &format!(" {}, ours: {differing}.", group.title);
         }
     }
     let in_game = |run: &Record| run.settings.get("environment.backend").is_some_and(|it| it == "starcraft");

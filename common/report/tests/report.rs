@@ -262,6 +262,8 @@ fn the_papers_numbers_stand_beside_ours_with_a_mark() {
     assert!(rit.starts_with("| rit | −342.4 ± 14.1 | 23.0 ± 0.7 (5) ▲ | 6.5 ± 1.5 | – |"), "{rit}");
     let roma = table.lines().find(|line| line.starts_with("| roma |")).unwrap();
     assert!(roma.starts_with("| roma | −1081.6 ± 303.8 | – |"), "{roma}");
+    let shorter = "Cooperative navigation, ours: training.t_max = 40 in place of 5050000.";
+    assert!(table.contains(shorter), "{table}");
 }
 
 #[test]
