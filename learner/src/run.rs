@@ -170,7 +170,8 @@ pub async fn run(
     let coordinator = Coordinator::new(config.clone(), beginning);
     let coordinator = Shell::new(coordinator, welcome, work, fences);
     if run_dir.paused().is_file() {
-        // A pause outlives the learner that was told to. The first event in the queue: no episode is handed out before.
+        // The learner before this one was killed while the run was paused. This is the first event: no episode is handed out
+        // before it.
         let (answer, _) = oneshot::channel();
         let _ = events.send(Event::Control(Control::Pause(answer))).await;
     }

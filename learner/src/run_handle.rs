@@ -176,8 +176,10 @@ impl RunHandle {
     pub async fn pause(&self) -> Result<v1::RunStatus, AskError> {
         let _one_at_a_time = self.setting.lock().await;
         let status = self.ask(Control::Pause).await?;
-        // A full disk may be why somebody pauses: it does not keep them from it.
-        if let Err(error) = write_whole(&self.run_dir.paused(), b"") {
+        // A run that is stopping is not paused. A full disk may be why somebody pauses: it does not keep them from it.
+        if status.state() == v1::RunState::Paused
+            && let Err(error) = write_whole(&self.run_dir.paused(), b"")
+        {
             let path = self.run_dir.paused();
             tracing::warn!(path = %path.display(), %error, "if the learner is killed, the next one will not be paused");
         }

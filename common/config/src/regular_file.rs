@@ -91,6 +91,7 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use rustix::fs::Mode;
 
     #[test]
     fn of_a_log_only_the_end_is_read() {
@@ -102,7 +103,6 @@ mod tests {
         assert_eq!(tail(100, 6), "", "it was cut off meanwhile");
         assert!(read_tail(&log.path().with_extension("gone"), 0, 6).is_err());
     }
-    use rustix::fs::Mode;
 
     #[test]
     fn only_regular_files_of_a_known_length_are_read() {

@@ -80,7 +80,7 @@ fn departures(groups: &[&Group], options: &Options) -> String {
             settings(&group.task_set, "rit").unwrap_or_default()
         };
         let (plain, presets) = (of(options.plain), of(of_presets));
-        // How long a run was sets no method apart, so what came to less than the paper's runs is among the others.
+        // Runs of every length go by their method's plain name.
         let runs = group.methods.iter().flat_map(|method| &method.runs);
         let lengths = runs.filter_map(|run| run.settings.get_key_value("training.t_max"));
         let differing: BTreeSet<String> = plain
