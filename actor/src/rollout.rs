@@ -64,7 +64,7 @@ impl Roller {
         let algorithm = &config.algorithm;
         Rollout::new(tasks, rit_worlds::factory(config), config.seed, algorithm.random_permutation)
             .with_exploration_persistence(algorithm.exploration_persistence)
-            .with_time_limit_bootstraps(algorithm.time_limit_bootstraps)
+            .with_time_limit(algorithm.time_limit)
     }
 
     /// Rolls leases until there are no more; says to the learner which are done.

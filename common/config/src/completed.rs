@@ -1,6 +1,6 @@
 //! Settings that an older build wrote down, as this one says them; and settings of a run that changes none.
 
-use crate::{ConfigError, resolve, saved::KNOWN_SINCE};
+use crate::{ConfigError, method_keys::TIME_LIMIT_BOOTSTRAPS, resolve, saved::KNOWN_SINCE};
 use std::collections::BTreeMap;
 use toml::{Table, Value};
 
@@ -16,6 +16,7 @@ pub fn completed(mut settings: BTreeMap<String, String>) -> BTreeMap<String, Str
                 settings.insert(key.to_owned(), value.clone());
             }
         }
+        settings.remove(&format!("algorithm.{TIME_LIMIT_BOOTSTRAPS}"));
     }
     settings
 }
@@ -76,6 +77,13 @@ mod tests {
         assert!(older.iter().all(|(key, value)| today[key] == *value));
         let on_policy = completed(of(&[("environment.task_set", "3-8m"), ("algorithm.name", "mappo")]));
         assert!(!on_policy.contains_key("algorithm.reward_scale"), "mappo has none");
+        let renamed = completed(of(&[
+            ("environment.task_set", "cooperative-navigation"),
+            ("algorithm.name", "mat"),
+            ("algorithm.time_limit_bootstraps", "true"),
+        ]));
+        assert_eq!(renamed["algorithm.time_limit"], "truncated");
+        assert!(!renamed.contains_key("algorithm.time_limit_bootstraps"));
     }
 
     #[test]

@@ -17,6 +17,7 @@ use rit_algo::{
 use rit_env::{
     EnvironmentOptions, Physics, Split, Task, TaskSet,
     combat::{CombatOptions, StatsVersion, world::ScriptedMedivac},
+    rollout::TimeLimit,
 };
 use rit_episode::{Dims, RunSeed};
 use rit_nn::OptimizerKind;
@@ -96,6 +97,7 @@ pub struct Algorithm {
     pub gamma: f32,
     #[serde(serialize_with = "number::shortest")]
     pub reward_scale: f32,
+    pub time_limit: TimeLimit,
     pub optimizer: OptimizerName,
     #[serde(serialize_with = "number::shortest")]
     pub lr: f32,
@@ -132,7 +134,6 @@ pub struct Algorithm {
     pub value_coef: f64,
     pub huber_delta: f64,
     pub value_norm_beta: f64,
-    pub time_limit_bootstraps: bool,
 }
 
 /// `[network]`.

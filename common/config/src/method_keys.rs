@@ -28,8 +28,7 @@ pub(crate) fn has(method: Method, key: &str) -> bool {
         | "algorithm.entropy_coef"
         | "algorithm.value_coef"
         | "algorithm.huber_delta"
-        | "algorithm.value_norm_beta"
-        | "algorithm.time_limit_bootstraps" => regime == Regime::OnPolicy,
+        | "algorithm.value_norm_beta" => regime == Regime::OnPolicy,
         "algorithm.encoder" => encoder == Encoder::Within,
         "algorithm.imagined_weight" => method == Method::Refil,
         "algorithm.role_entropy_weight"
@@ -197,6 +196,26 @@ pub(crate) fn translate_ablations(typed: &mut Table, base: Method) -> Result<(),
     Ok(())
 }
 
+/// The key that `algorithm.time_limit` has replaced.
+pub(crate) const TIME_LIMIT_BOOTSTRAPS: &str = "time_limit_bootstraps";
+
+/// Puts `algorithm.time_limit` in the place of the older key that only on-policy methods had.
+pub(crate) fn translate_time_limit(typed: &mut Table) -> Result<(), ConfigError> {
+    let Some(Value::Table(algorithm)) = typed.get_mut("algorithm") else { return Ok(()) };
+    let counts_as = match algorithm.remove(TIME_LIMIT_BOOTSTRAPS) {
+        None => return Ok(()),
+        Some(Value::Boolean(true)) => "truncated",
+        Some(Value::Boolean(false)) => "environment",
+        Some(_) => {
+            return Err(ConfigError::Value(format!(
+                "algorithm.{TIME_LIMIT_BOOTSTRAPS} must be true or false"
+            )));
+        }
+    };
+    algorithm.insert("time_limit".to_owned(), Value::from(counts_as));
+    Ok(())
+}
+
 /// A method by its name, in files.
 pub(crate) mod by_name {
     use rit_algo::Method;
@@ -215,6 +234,7 @@ pub(crate) mod by_name {
 mod tests {
     use super::*;
     use crate::{Config, OptimizerName, resolve, set};
+    use rit_env::rollout::TimeLimit;
 
     fn with(task_set: &str, settings: &[&str]) -> Result<Config, ConfigError> {
         let settings: Vec<Table> = settings.iter().map(|text| set(text).unwrap()).collect();
@@ -242,6 +262,12 @@ mod tests {
             message,
             "algorithm.mixing follows from algorithm.name = refil; `rit experiments` lists the other algorithms"
         );
+        let time_limit =
+            |settings: &[&str]| with("matrix-game", settings).map(|config| config.algorithm.time_limit);
+        let [bootstraps, does_not] =
+            ["true", "false"].map(|is| format!("algorithm.time_limit_bootstraps={is}"));
+        assert_eq!(time_limit(&["algorithm.name=mat", &bootstraps]), Ok(TimeLimit::Truncated));
+        assert_eq!(time_limit(&["algorithm.time_limit=terminated", &does_not]), Ok(TimeLimit::Environment));
         // An experiment of a person's own, from before.
         let experiment = "environment.task_set = 'matrix-game'\nalgorithm.mixing = 'sum'";
         let config = resolve(experiment, "test", &[set(none).unwrap()]).unwrap();
@@ -295,7 +321,9 @@ mod tests {
     /// The specification of the on-policy methods, section 7.
     #[test]
     fn on_policy_presets_are_those_of_the_table() {
-        for (name, clip, bootstraps) in [("mappo", 0.2, false), ("mat", 0.05, true)] {
+        for (name, clip, time_limit) in
+            [("mappo", 0.2, TimeLimit::Environment), ("mat", 0.05, TimeLimit::Truncated)]
+        {
             let algorithm =
                 |task_set| with(task_set, &[&format!("algorithm.name={name}")]).unwrap().algorithm;
             let (matrix, mpe) = (algorithm("matrix-game"), algorithm("cooperative-navigation"));
@@ -306,10 +334,10 @@ mod tests {
                 assert_eq!((algorithm.random_permutation, algorithm.grad_norm_clip), (false, 10.0));
             }
             assert_eq!(
-                (matrix.lr, matrix.n_rollout_threads, matrix.time_limit_bootstraps),
-                (5e-4, 32, false)
+                (matrix.lr, matrix.n_rollout_threads, matrix.time_limit),
+                (5e-4, 32, TimeLimit::Environment)
             );
-            assert_eq!((mpe.lr, mpe.n_rollout_threads, mpe.time_limit_bootstraps), (7e-4, 8, bootstraps));
+            assert_eq!((mpe.lr, mpe.n_rollout_threads, mpe.time_limit), (7e-4, 8, time_limit));
         }
         let lag =
             with("matrix-game", &["algorithm.name=mat", "algorithm.policy_lag=1"]).unwrap_err().to_string();

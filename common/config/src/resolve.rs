@@ -23,11 +23,13 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
     let defaults = defaults()?;
     let mut typed = parse(experiment, source_name)?;
     method_keys::translate_ablations(&mut typed, Method::Rit)?;
+    method_keys::translate_time_limit(&mut typed)?;
     let mut set = Table::new();
     for setting in settings {
         merge(&mut set, setting.clone());
     }
     method_keys::translate_ablations(&mut set, method_keys::named(&typed)?)?;
+    method_keys::translate_time_limit(&mut set)?;
     merge(&mut typed, set);
     keys::check(&typed, &defaults)?;
     foreign::choose(&mut typed)?;

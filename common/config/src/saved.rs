@@ -2,7 +2,7 @@
 //! is named: today's default for it would be a guess.
 
 use crate::{
-    Config, ConfigError, resolve,
+    Config, ConfigError, method_keys, resolve,
     resolve::{flat, is_free},
     run_dir::CONFIG,
 };
@@ -13,8 +13,8 @@ use toml::{Table, Value};
 const FORMAT_VERSION: i64 = 1;
 
 /// Keys of which builds that did not know them did what the default says, so that it is no guess.
-pub(crate) const KNOWN_SINCE: [&str; 3] =
-    ["environment.backend", "environment.physics", "algorithm.reward_scale"];
+pub(crate) const KNOWN_SINCE: [&str; 4] =
+    ["environment.backend", "environment.physics", "algorithm.reward_scale", "algorithm.time_limit"];
 
 /// Its key, the first of the file.
 const KEY: &str = "format_version";
@@ -43,6 +43,7 @@ pub(crate) fn resolve_saved(text: &str, settings: &[Table]) -> Result<Saved, Con
         Some(found) => return Err(ConfigError::Format { found: found.to_string() }),
         None => notices.push(format!("{CONFIG} carries no {KEY}: an older build wrote it")),
     }
+    method_keys::translate_time_limit(&mut table)?;
     let typed = keys(&table);
     let text = toml::to_string(&table).map_err(|error| ConfigError::Value(error.to_string()))?;
     let saved = resolve(&text, CONFIG, &[])?;

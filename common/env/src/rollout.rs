@@ -6,6 +6,7 @@ use rit_episode::{
     Action, Choice, End, Episode, EpisodeBuilder, Exploration, Observation, Policy, Rng, RunSeed, Stream,
     Turn, decision_order,
 };
+use serde::{Deserialize, Serialize};
 use std::{mem, sync::Arc};
 
 /// An episode to be rolled.
@@ -29,11 +30,23 @@ pub struct Rollout {
     seed: RunSeed,
     random_permutation: bool,
     exploration_persistence: f32,
-    /// Whether an episode that ends at the task's limit counts as cut off there.
-    time_limit_bootstraps: bool,
+    time_limit: TimeLimit,
     lost_rounds_max: usize,
     /// Worlds that wait for their next episode, by task.
     idle: Vec<Vec<Seated>>,
+}
+
+/// What the end of an episode counts as that is as long as its task allows.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum TimeLimit {
+    /// What its environment says.
+    #[default]
+    Environment,
+    /// A cut, unless it is won: values go on beyond it. For methods whose values cannot tell how much time is left.
+    Truncated,
+    /// The end of the task: nothing is earned beyond it.
+    Terminated,
 }
 
 /// An episode that ended early because its environment could not go on.
@@ -76,8 +89,8 @@ struct Running {
     /// Whether its environment could be told the actions.
     told: Result<(), EnvironmentError>,
     builder: EpisodeBuilder,
-    /// Steps after which an end is the time limit's, not the task's; `None` where every end is the environment's.
-    time_limit: Option<usize>,
+    time_limit: TimeLimit,
+    steps_max: usize,
     steps: usize,
 }
 
@@ -101,7 +114,7 @@ impl Rollout {
             seed,
             random_permutation,
             exploration_persistence: 0.0,
-            time_limit_bootstraps: false,
+            time_limit: TimeLimit::Environment,
             lost_rounds_max: LOST_ROUNDS_MAX,
             idle,
         }
@@ -112,10 +125,9 @@ impl Rollout {
         Self { exploration_persistence, ..self }
     }
 
-    /// Counts an episode as long as its task's limit as truncated, though the environment may call it terminated: for
-    /// methods whose values cannot tell how much time is left.
-    pub fn with_time_limit_bootstraps(self, time_limit_bootstraps: bool) -> Self {
-        Self { time_limit_bootstraps, ..self }
+    /// What the end of an episode as long as its task's limit counts as.
+    pub fn with_time_limit(self, time_limit: TimeLimit) -> Self {
+        Self { time_limit, ..self }
     }
 
     /// Gives up after so many rounds in a row that brought no episode at all; see [`Self::roll_all`].
@@ -266,7 +278,8 @@ impl Rollout {
             slot,
             number: job.number,
             task,
-            time_limit: self.time_limit_bootstraps.then(|| world.spec().steps_max),
+            time_limit: self.time_limit,
+            steps_max: world.spec().steps_max,
             steps: 0,
             world,
             environment_rng,
@@ -317,8 +330,13 @@ impl Running {
         self.builder.step(&self.actions, step.reward, step.shaping, &self.observation);
         self.previous_reward = step.reward;
         self.steps += 1;
-        let cut_off = self.time_limit.is_some_and(|limit| self.steps >= limit);
-        Ok(step.end.map(|end| (if cut_off { End::Truncated } else { end }, step.won)))
+        let is_at_limit = self.steps >= self.steps_max;
+        let end_of = |end| match self.time_limit {
+            TimeLimit::Truncated if is_at_limit && !step.won => End::Truncated,
+            TimeLimit::Terminated if is_at_limit => End::Terminated,
+            _ => end,
+        };
+        Ok(step.end.map(|end| (end_of(end), step.won)))
     }
 }
 

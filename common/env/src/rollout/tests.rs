@@ -1,5 +1,5 @@
 use super::*;
-use crate::{Embedded, EnvironmentOptions, FailureKind, Script, Spec, Split, Step, TaskSet};
+use crate::{Embedded, EnvironmentOptions, FailureKind, Physics, Script, Spec, Split, Step, TaskSet};
 use crate::{Environment, matrix_game::MatrixGame};
 use rit_episode::decision_order::is_permutation;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -65,12 +65,31 @@ fn actions_are_mapped_back_through_the_decision_order() {
 }
 
 #[test]
-fn an_end_at_the_time_limit_can_count_as_a_cut() {
-    let end = |bootstraps| {
-        let mut rollout = rollout(1, true).with_time_limit_bootstraps(bootstraps);
-        all_rolled(rollout.roll(&mut Fixed([0, 0]), &jobs(0..1))).unwrap()[0].end
+fn an_end_at_the_time_limit_counts_as_what_is_asked_for() {
+    let end = |rollout: Rollout, policy: &mut dyn Policy, time_limit| {
+        let rolled = rollout.with_time_limit(time_limit).roll(policy, &jobs(0..1));
+        let episode = all_rolled(rolled).unwrap().remove(0);
+        (episode.end, episode.won)
     };
-    assert_eq!((end(false), end(true)), (End::Terminated, End::Truncated));
+    let [asked, cut, over] = [TimeLimit::Environment, TimeLimit::Truncated, TimeLimit::Terminated];
+    // The matrix game calls its last step the end; a game that is won there stays so.
+    let game = |time_limit| end(rollout(1, true), &mut Fixed([0, 0]), time_limit);
+    assert_eq!(game(asked), (End::Terminated, false));
+    assert_eq!(game(cut), (End::Truncated, false));
+    assert_eq!(game(over), (End::Terminated, false));
+    let won = |time_limit| end(rollout(5, false), &mut Fixed([0, 2]), time_limit);
+    assert_eq!([asked, cut, over].map(won), [(End::Terminated, true); 3]);
+    // Simple spread of mpe2 calls it a cut.
+    let spread = |time_limit| {
+        let options = EnvironmentOptions { physics: Physics::Mpe2, ..EnvironmentOptions::default() };
+        let tasks = TaskSet::CooperativeNavigation.tasks(Split::Training);
+        let rollout = Rollout::new(tasks, Arc::new(Embedded(options)), RunSeed(2), true);
+        end(rollout, &mut Script::Random, time_limit)
+    };
+    assert_eq!(
+        [asked, cut, over].map(spread).map(|(end, _)| end),
+        [End::Truncated, End::Truncated, End::Terminated]
+    );
 }
 
 #[test]
