@@ -37,6 +37,19 @@ fn a_pause_outlives_the_learner_and_not_the_run() {
 }
 
 #[test]
+fn a_stop_ends_a_pause() {
+    let folder = RunFolder::new();
+    let mut train = folder.start(&["matrix-game", "--actors", "1", "--seed", "1"]);
+    train.wait_for("training", |status| status["updates"].as_u64() > Some(10));
+    let paused = folder.run_dir().join("paused");
+    assert_eq!(json(&train.ctl(&["pause"]))["state"], "paused");
+    assert!(paused.is_file());
+    assert_eq!(json(&train.ctl(&["stop"]))["state"], "stopping");
+    train.finish_stopped();
+    assert!(!paused.exists(), "the run would go on paused");
+}
+
+#[test]
 fn a_run_is_paused_evaluated_saved_resumed_and_stopped() {
     let folder = RunFolder::new();
     let mut train = folder.start(&["matrix-game", "--actors", "2", "--seed", "1"]);

@@ -169,34 +169,21 @@ pub async fn run(
     beginning.warnings.extend(notice);
     let coordinator = Coordinator::new(config.clone(), beginning);
     let coordinator = Shell::new(coordinator, welcome, work, fences);
-    if run_dir.paused().is_file() {
-        // The learner before this one was killed while the run was paused. This is the first event: no episode is handed out
-        // before it.
-        let (answer, _) = oneshot::channel();
-        let _ = events.send(Event::Control(Control::Pause(answer))).await;
-    }
+    pause_again(&run_dir, &events).await;
 
     let stop = Arc::new(AtomicBool::new(false));
     let expected = Arc::new(expected);
     let episodes = EpisodesService { events: events.clone(), expected: Arc::clone(&expected) };
     let receiving = {
-        let (events, stop, run_dir) = (events.clone(), Arc::clone(&stop), run_dir.clone());
-        spawn("receive", move || {
+        let (stop, run_dir) = (Arc::clone(&stop), run_dir.clone());
+        let to_coordinator = events.clone();
+        spawn_until_over("receive", &events, move || {
             let renew = || new_receiver(&run_dir, limits);
-            let result = receive(receiver, renew, &expected, &events, &fence_queue, &stop);
-            let _ = events.blocking_send(Event::Over);
-            result
+            receive(receiver, renew, &expected, &to_coordinator, &fence_queue, &stop)
         })?
     };
     let writing = spawn("write", move || writer.run(&write_queue))?;
-    let training = {
-        let events = events.clone();
-        spawn("train", move || {
-            let result = trainer.run(&work_queue);
-            let _ = events.blocking_send(Event::Over);
-            result
-        })?
-    };
+    let training = spawn_until_over("train", &events, move || trainer.run(&work_queue))?;
 
     let handle =
         RunHandle::new(events.clone(), board.clone(), config, run_dir.clone(), model, measures, set_log);
@@ -205,61 +192,24 @@ pub async fn run(
         tracing::info!(address = %web.address(), "the web page is served");
         serving_web.spawn(web.serve(handle.clone(), metrics.clone(), run_dir.clone()));
     }
-    let episode_bytes_max = episodes.message_bytes_max();
-    let weights = WeightsServer::new(WeightsService(board));
-    let control = ControlService { run: handle, metrics };
-    let rollout = RolloutServer::new(RolloutService { events: events.clone(), cpu });
-    let (health_reporter, health) = tonic_health::server::health_reporter();
-    health_reporter.set_serving::<WeightsServer<WeightsService>>().await;
-    health_reporter.set_serving::<RolloutServer<RolloutService>>().await;
-    health_reporter.set_serving::<EpisodesServer<EpisodesService>>().await;
-    health_reporter.set_serving::<ControlServer<ControlService>>().await;
-    let routes = Routes::new(health)
-        .add_service(weights.max_decoding_message_size(REQUEST_BYTES_MAX))
-        .add_service(rollout.max_decoding_message_size(REQUEST_BYTES_MAX))
-        .add_service(EpisodesServer::new(episodes).max_decoding_message_size(episode_bytes_max))
-        .add_service(ControlServer::new(control).max_decoding_message_size(REQUEST_BYTES_MAX));
+    let services = Services {
+        weights: WeightsService(board),
+        rollout: RolloutService { events: events.clone(), cpu },
+        episodes,
+        control: ControlService { run: handle, metrics },
+    };
+    let routes = services.routes().await;
     // From here on it goes on: what was said of its end is true no more.
     Summary::remove(&run_dir)
         .map_err(|error| LearnerError::Io { what: run_dir.summary().display().to_string(), error })?;
-    // What a learner that was killed has left; this one may not listen for other hosts.
-    let _ = fs::remove_file(run_dir.remote_address());
     let (close, closed) = watch::channel(());
-    let mut servers = JoinSet::new();
-    for (incoming, access) in doors {
-        tell_address(&run_dir, incoming.address())?;
-        tracing::info!(address = %incoming.address(), ?access, "the learner listens");
-        let mut closed = closed.clone();
-        let closed = async move {
-            // Never a value: it changes by its end.
-            let _ = closed.changed().await;
-        };
-        servers.spawn(serve(incoming, access, ServeLimits::default(), routes.clone(), closed));
-    }
+    let servers = serve_all(&run_dir, doors, &routes, &closed)?;
 
-    let coordinating = coordinator.run(event_queue);
-    tokio::pin!(coordinating, shutdown);
-    tokio::select! {
-        () = &mut coordinating => {}
-        () = &mut shutdown => {
-            let (answer, _) = oneshot::channel();
-            let _ = events.send(Event::Control(Control::Stop { drain: false, ended: Ended::Interrupted, answer })).await;
-            coordinating.await;
-        }
-    }
+    coordinate(coordinator.run(event_queue), &events, shutdown).await;
 
     stop.store(true, Ordering::Relaxed);
     drop(close);
-    // Connections that are open even then have had their time.
-    let closing = async {
-        while let Some(served) = servers.join_next().await {
-            if let Ok(Err(error)) = served {
-                tracing::error!(%error, "a gRPC server failed");
-            }
-        }
-    };
-    let _ = tokio::time::timeout(CLOSE_TIMEOUT, closing).await;
-    let _ = tokio::time::timeout(CLOSE_TIMEOUT, serving_web.join_next()).await;
+    close_connections(servers, serving_web).await;
     for file in [run_dir.address(), run_dir.remote_address(), run_dir.paused()] {
         let _ = fs::remove_file(file);
     }
@@ -273,6 +223,100 @@ pub async fn run(
         tracing::error!(%error, "summary.json was not written");
     }
     ended
+}
+
+/// What the learner answers over gRPC.
+struct Services {
+    weights: WeightsService,
+    rollout: RolloutService,
+    episodes: EpisodesService,
+    control: ControlService,
+}
+
+impl Services {
+    /// All of them, and their health.
+    async fn routes(self) -> Routes {
+        let (health_reporter, health) = tonic_health::server::health_reporter();
+        health_reporter.set_serving::<WeightsServer<WeightsService>>().await;
+        health_reporter.set_serving::<RolloutServer<RolloutService>>().await;
+        health_reporter.set_serving::<EpisodesServer<EpisodesService>>().await;
+        health_reporter.set_serving::<ControlServer<ControlService>>().await;
+        let episode_bytes_max = self.episodes.message_bytes_max();
+        let weights = WeightsServer::new(self.weights).max_decoding_message_size(REQUEST_BYTES_MAX);
+        let rollout = RolloutServer::new(self.rollout).max_decoding_message_size(REQUEST_BYTES_MAX);
+        let episodes = EpisodesServer::new(self.episodes).max_decoding_message_size(episode_bytes_max);
+        let control = ControlServer::new(self.control).max_decoding_message_size(REQUEST_BYTES_MAX);
+        Routes::new(health)
+            .add_service(weights)
+            .add_service(rollout)
+            .add_service(episodes)
+            .add_service(control)
+    }
+}
+
+/// Serves at every door until `closed` changes, and tells readers of the run directory where.
+fn serve_all(
+    run_dir: &RunDir,
+    doors: Vec<(Incoming, Access)>,
+    routes: &Routes,
+    closed: &watch::Receiver<()>,
+) -> Result<JoinSet<Result<(), tonic::transport::Error>>, LearnerError> {
+    // What a learner that was killed has left; this one may not listen for other hosts.
+    let _ = fs::remove_file(run_dir.remote_address());
+    let mut servers = JoinSet::new();
+    for (incoming, access) in doors {
+        tell_address(run_dir, incoming.address())?;
+        tracing::info!(address = %incoming.address(), ?access, "the learner listens");
+        let mut closed = closed.clone();
+        let closed = async move {
+            // Never a value: it changes by its end.
+            let _ = closed.changed().await;
+        };
+        servers.spawn(serve(incoming, access, ServeLimits::default(), routes.clone(), closed));
+    }
+    Ok(servers)
+}
+
+/// Pauses a run whose learner was killed while it was paused: the first event, so no episode is handed out before it.
+async fn pause_again(run_dir: &RunDir, events: &async_mpsc::Sender<Event>) {
+    if run_dir.paused().is_file() {
+        let (answer, _) = oneshot::channel();
+        let _ = events.send(Event::Control(Control::Pause(answer))).await;
+    }
+}
+
+/// Coordinates until the run is over. `shutdown` interrupts it.
+async fn coordinate(
+    coordinating: impl Future<Output = ()>,
+    events: &async_mpsc::Sender<Event>,
+    shutdown: impl Future<Output = ()>,
+) {
+    tokio::pin!(coordinating, shutdown);
+    tokio::select! {
+        () = &mut coordinating => {}
+        () = &mut shutdown => {
+            let (answer, _) = oneshot::channel();
+            let interrupt = Control::Stop { drain: false, ended: Ended::Interrupted, answer };
+            let _ = events.send(Event::Control(interrupt)).await;
+            coordinating.await;
+        }
+    }
+}
+
+/// Waits for servers to close their connections. Those that are open even after [`CLOSE_TIMEOUT`] have had their time.
+async fn close_connections(
+    mut servers: JoinSet<Result<(), tonic::transport::Error>>,
+    mut serving_web: JoinSet<()>,
+) {
+    let closing = async {
+        while let Some(served) = servers.join_next().await {
+            if let Ok(Err(error)) = served {
+                tracing::error!(%error, "a gRPC server failed");
+            }
+        }
+    };
+    let _ = tokio::time::timeout(CLOSE_TIMEOUT, closing).await;
+    let _ = tokio::time::timeout(CLOSE_TIMEOUT, serving_web.join_next()).await;
 }
 
 /// A receiver in a place of its own; the second value says where that is not where it should be.
@@ -318,6 +362,20 @@ fn spawn<T: Send + 'static>(
     });
     started.map_err(|error| LearnerError::Io { what: format!("the {name} thread"), error })?;
     Ok(result)
+}
+
+/// As [`spawn`], and tells the coordinator when the work has ended: a run goes on with all of its threads or not at all.
+fn spawn_until_over<T: Send + 'static>(
+    name: &'static str,
+    events: &async_mpsc::Sender<Event>,
+    work: impl FnOnce() -> T + Send + 'static,
+) -> Result<oneshot::Receiver<T>, LearnerError> {
+    let events = events.clone();
+    spawn(name, move || {
+        let result = work();
+        let _ = events.blocking_send(Event::Over);
+        result
+    })
 }
 
 /// Where the learner listens and what callers must show: the run directory's socket, and TCP if it is asked for.
