@@ -125,6 +125,8 @@ fn the_committed_records_make_a_report() {
         "--by",
         "algorithm.gamma",
         "--by",
+        "algorithm.time_limit",
+        "--by",
         "environment.approach_shaping",
     ];
     let made = output(&[&arguments[..], &by].concat());

@@ -1,22 +1,27 @@
 //! Settings that an older build wrote down, as this one says them; and settings of a run that changes none.
 
-use crate::{ConfigError, method_keys::TIME_LIMIT_BOOTSTRAPS, resolve, saved::KNOWN_SINCE};
+use crate::{
+    ConfigError,
+    method_keys::{TIME_LIMIT_BOOTSTRAPS, time_limit},
+    resolve,
+    saved::KNOWN_SINCE,
+};
 use std::collections::BTreeMap;
 use toml::{Table, Value};
 
-/// These settings with those keys that have been added since and whose default is what was done before, so that what an
-/// older build wrote compares with what this one writes. Settings that this build does not know, or refuses, stay as they
+/// These settings with those keys that have been added since, as was done before, so that what an older build wrote compares
+/// with what this one writes. Settings that this build does not know, or refuses, stay as they
 /// are.
 pub fn completed(mut settings: BTreeMap<String, String>) -> BTreeMap<String, String> {
-    if KNOWN_SINCE.iter().any(|key| !settings.contains_key(*key))
+    if let Some(bootstraps) = settings.remove(&format!("algorithm.{TIME_LIMIT_BOOTSTRAPS}")) {
+        settings.insert("algorithm.time_limit".to_owned(), time_limit(bootstraps == "true").to_owned());
+    }
+    if KNOWN_SINCE.iter().any(|(key, _)| !settings.contains_key(*key))
         && let Ok(today) = today(&settings)
     {
-        for key in KNOWN_SINCE {
-            if let (false, Some(value)) = (settings.contains_key(key), today.get(key)) {
-                settings.insert(key.to_owned(), value.clone());
-            }
+        for (key, then) in KNOWN_SINCE.into_iter().filter(|(key, _)| today.contains_key(*key)) {
+            settings.entry(key.to_owned()).or_insert_with(|| then.to_owned());
         }
-        settings.remove(&format!("algorithm.{TIME_LIMIT_BOOTSTRAPS}"));
     }
     settings
 }
@@ -73,6 +78,7 @@ mod tests {
         let today = completed(older.clone());
         assert_eq!(today["algorithm.reward_scale"], "1.0");
         assert_eq!(today["environment.backend"], "embedded");
+        assert_eq!(today["algorithm.time_limit"], "environment", "the preset of combat says otherwise today");
         assert!(!today.contains_key("environment.spawn_rotate"), "what was done then is not known");
         assert!(older.iter().all(|(key, value)| today[key] == *value));
         let on_policy = completed(of(&[("environment.task_set", "3-8m"), ("algorithm.name", "mappo")]));

@@ -92,6 +92,7 @@ fn former(key: &str) -> Option<Value> {
     match key {
         "algorithm.mixing" => Some(Value::from("network")),
         "algorithm.task_representations" => Some(Value::from(true)),
+        "algorithm.time_limit_bootstraps" => Some(Value::from(false)),
         _ => None,
     }
 }

@@ -202,18 +202,23 @@ pub(crate) const TIME_LIMIT_BOOTSTRAPS: &str = "time_limit_bootstraps";
 /// Puts `algorithm.time_limit` in the place of the older key that only on-policy methods had.
 pub(crate) fn translate_time_limit(typed: &mut Table) -> Result<(), ConfigError> {
     let Some(Value::Table(algorithm)) = typed.get_mut("algorithm") else { return Ok(()) };
-    let counts_as = match algorithm.remove(TIME_LIMIT_BOOTSTRAPS) {
-        None => return Ok(()),
-        Some(Value::Boolean(true)) => "truncated",
-        Some(Value::Boolean(false)) => "environment",
+    match algorithm.remove(TIME_LIMIT_BOOTSTRAPS) {
+        None => {}
+        Some(Value::Boolean(bootstraps)) => {
+            algorithm.insert("time_limit".to_owned(), Value::from(time_limit(bootstraps)));
+        }
         Some(_) => {
             return Err(ConfigError::Value(format!(
                 "algorithm.{TIME_LIMIT_BOOTSTRAPS} must be true or false"
             )));
         }
-    };
-    algorithm.insert("time_limit".to_owned(), Value::from(counts_as));
+    }
     Ok(())
+}
+
+/// What `algorithm.time_limit` is where the older key was this.
+pub(crate) fn time_limit(bootstraps: bool) -> &'static str {
+    if bootstraps { "truncated" } else { "environment" }
 }
 
 /// A method by its name, in files.

@@ -3,8 +3,9 @@
 
 use crate::{
     Config, ConfigError, method_keys, resolve,
-    resolve::{flat, is_free},
+    resolve::{flat, is_free, merge},
     run_dir::CONFIG,
+    set,
 };
 use std::collections::BTreeSet;
 use toml::{Table, Value};
@@ -12,9 +13,13 @@ use toml::{Table, Value};
 /// What this build writes. Raise it when what a key means changes.
 const FORMAT_VERSION: i64 = 1;
 
-/// Keys of which builds that did not know them did what the default says, so that it is no guess.
-pub(crate) const KNOWN_SINCE: [&str; 4] =
-    ["environment.backend", "environment.physics", "algorithm.reward_scale", "algorithm.time_limit"];
+/// Keys that have been added since, and what builds did that did not know them: no guess, whatever a preset says today.
+pub(crate) const KNOWN_SINCE: [(&str, &str); 4] = [
+    ("environment.backend", "embedded"),
+    ("environment.physics", "original"),
+    ("algorithm.reward_scale", "1.0"),
+    ("algorithm.time_limit", "environment"),
+];
 
 /// Its key, the first of the file.
 const KEY: &str = "format_version";
@@ -45,17 +50,24 @@ pub(crate) fn resolve_saved(text: &str, settings: &[Table]) -> Result<Saved, Con
     }
     method_keys::translate_time_limit(&mut table)?;
     let typed = keys(&table);
-    let text = toml::to_string(&table).map_err(|error| ConfigError::Value(error.to_string()))?;
-    let saved = resolve(&text, CONFIG, &[])?;
-    let missing: Vec<String> = flat(&saved)?.into_keys().filter(|key| !typed.contains(key)).collect();
-    let is_a_guess = |key: &&String| !is_free(key) && !KNOWN_SINCE.contains(&key.as_str());
-    if let Some(key) = missing.iter().find(is_a_guess) {
+    let to_text =
+        |table: &Table| toml::to_string(table).map_err(|error| ConfigError::Value(error.to_string()));
+    let today = flat(&resolve(&to_text(&table)?, CONFIG, &[])?)?;
+    let (known, missing): (Vec<String>, Vec<String>) = today
+        .into_keys()
+        .filter(|key| !typed.contains(key))
+        .partition(|key| KNOWN_SINCE.iter().any(|(known, _)| known == key));
+    if let Some(key) = missing.iter().find(|key| !is_free(key)) {
         return Err(ConfigError::Incomplete { key: key.clone() });
     }
     if !missing.is_empty() {
         notices.push(format!("{CONFIG} lacks {}: today's defaults are taken", missing.join(", ")));
     }
-    let config = if settings.is_empty() { saved } else { resolve(&text, CONFIG, settings)? };
+    for (key, then) in KNOWN_SINCE.iter().filter(|(key, _)| known.iter().any(|known| known == key)) {
+        merge(&mut table, set(&format!("{key}={then}"))?);
+        notices.push(format!("{CONFIG} lacks {key}: {then}, as builds did that had no such key"));
+    }
+    let config = resolve(&to_text(&table)?, CONFIG, settings)?;
     Ok(Saved { config, notices })
 }
 
@@ -74,7 +86,7 @@ fn keys(table: &Table) -> BTreeSet<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::set;
+    use rit_env::rollout::TimeLimit;
 
     fn config() -> Config {
         resolve("environment.task_set = \"matrix-game\"\nseed = 5", "test", &[]).unwrap()
@@ -111,13 +123,21 @@ mod tests {
         );
         assert_eq!(
             notices(&without("backend")),
-            ["config.toml lacks environment.backend: today's defaults are taken"],
-            "an older build had the embedded one alone"
+            ["config.toml lacks environment.backend: embedded, as builds did that had no such key"],
         );
         assert_eq!(
             notices(&without("format_version")),
             ["config.toml carries no format_version: an older build wrote it"]
         );
+        // What a preset says today is not what was done.
+        let combat = resolve("environment.task_set = \"3-8m\"", "test", &[]).unwrap();
+        assert_eq!(combat.algorithm.time_limit, TimeLimit::Terminated);
+        let lines = to_text(&combat).unwrap();
+        let older: String =
+            lines.split_inclusive('\n').filter(|line| !line.starts_with("time_limit")).collect();
+        let of = |settings: &[Table]| resolve_saved(&older, settings).unwrap().config.algorithm.time_limit;
+        assert_eq!(of(&[]), TimeLimit::Environment);
+        assert_eq!(of(&[set("algorithm.time_limit=truncated").unwrap()]), TimeLimit::Truncated);
         let newer = text.replacen("format_version = 1", "format_version = 2", 1);
         assert_eq!(
             error(&newer),

@@ -67,7 +67,8 @@ fn actions_are_mapped_back_through_the_decision_order() {
 #[test]
 fn an_end_at_the_time_limit_counts_as_what_is_asked_for() {
     let end = |rollout: Rollout, policy: &mut dyn Policy, time_limit| {
-        let rolled = rollout.with_time_limit(time_limit).roll(policy, &jobs(0..1));
+        let job = Job { task: Some(0), ..jobs(0..1)[0] };
+        let rolled = rollout.with_time_limit(time_limit).roll(policy, &[job]);
         let episode = all_rolled(rolled).unwrap().remove(0);
         (episode.end, episode.won)
     };
