@@ -36,16 +36,16 @@ pub struct Rollout {
     idle: Vec<Vec<Seated>>,
 }
 
-/// What the end of an episode counts as that is as long as its task allows.
+/// How an episode ends that reaches its task's time limit.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum TimeLimit {
-    /// What its environment says.
+    /// As its environment says.
     #[default]
     Environment,
-    /// A cut, unless it is won: values go on beyond it. For methods whose values cannot tell how much time is left.
+    /// Cut off, unless it is won: values go on beyond it. For methods whose values cannot tell how much time is left.
     Truncated,
-    /// The end of the task: nothing is earned beyond it.
+    /// Over: nothing is earned beyond it.
     Terminated,
 }
 
@@ -125,7 +125,7 @@ impl Rollout {
         Self { exploration_persistence, ..self }
     }
 
-    /// What the end of an episode as long as its task's limit counts as.
+    /// Ends episodes that reach their task's time limit so.
     pub fn with_time_limit(self, time_limit: TimeLimit) -> Self {
         Self { time_limit, ..self }
     }
