@@ -3,9 +3,9 @@
 
     pip install numpy
     rit export --run DIR --episodes 32 --tasks 3s,3s3z --out episodes.safetensors
-    deploy/checks/check_combat.py episodes.safetensors
+    python3 deploy/checks/check_combat.py episodes.safetensors
 
-Positions are worked out from the features. Distances within 0.0001 of a rule's limit are left out, since a feature has no more
+For units with their usual numbers (environment.stats = "liberty"). Positions are worked out from the features. Distances within 0.0001 of a rule's limit are left out, since a feature has no more
 digits. Exit code 0: everything agrees; 1: something does not.
 """
 
@@ -130,6 +130,8 @@ def check(about, task, data):
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
     about, tasks = read(sys.argv[1])
     wrong = sum([check(about, task, data) for task, data in tasks.items()])
     sys.exit(1 if wrong else 0)

@@ -3,7 +3,7 @@
 
     pip install numpy
     rit export --run DIR --episodes 32 --tasks 3s,3s3z --out episodes.safetensors
-    deploy/checks/compare_values.py episodes.safetensors DIR/checkpoints/latest/weights.safetensors
+    python3 deploy/checks/compare_values.py episodes.safetensors DIR/checkpoints/latest/weights.safetensors
 
 The policy is that of deploy/docs/weights.md; Q_total is put together here, as the paper's appendix G has it. Greedy episodes of the
 same weights: every action is compared, and exit code 1 says that one differs.
@@ -81,4 +81,6 @@ def main(episodes, weights):
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
     sys.exit(main(*sys.argv[1:3]))
