@@ -10,8 +10,7 @@ use std::collections::BTreeMap;
 use toml::{Table, Value};
 
 /// These settings with those keys that have been added since, as was done before, so that what an older build wrote compares
-/// with what this one writes. Settings that this build does not know, or refuses, stay as they
-/// are.
+/// with what this one writes. Settings that this build does not know, or refuses, stay as they are.
 pub fn completed(mut settings: BTreeMap<String, String>) -> BTreeMap<String, String> {
     if let Some(bootstraps) = settings.remove(&format!("algorithm.{TIME_LIMIT_BOOTSTRAPS}")) {
         settings.insert("algorithm.time_limit".to_owned(), time_limit(bootstraps == "true").to_owned());
