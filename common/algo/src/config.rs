@@ -78,7 +78,7 @@ impl Default for RoleConfig {
     }
 }
 
-/// A model that cannot be.
+/// Why there is no model of these sizes.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ConfigError {
     /// A size of zero.

@@ -164,7 +164,7 @@ pub fn restore(places: Vec<(&'static str, Place<'_>)>, state: &[NamedState<'_>])
             (Place::F32(place), Numbers::F32(numbers)) => place.copy_from_slice(numbers),
             (Place::F64(place), Numbers::F64(numbers)) => place.copy_from_slice(numbers),
             (Place::U64(place), Numbers::U64(numbers)) => place.copy_from_slice(numbers),
-            // Told above.
+            // The first loop has refused every other combination.
             _ => {}
         }
     }

@@ -105,7 +105,7 @@ pub struct Ppo<N> {
     pub params: Vec<f32>,
     /// The optimiser and its moments.
     pub optimizer: Optimizer,
-    /// In whose units the values are.
+    /// Running mean and deviation of returns: the critic's outputs are in its normalised units.
     pub value_norm: ValueNorm,
     grads: Vec<f32>,
     shards: Vec<Shard>,
@@ -159,8 +159,8 @@ impl<N: ActorCritic> Ppo<N> {
     }
 
     /// One update on a batch: `stream(epoch)` draws the order in which that epoch's minibatches take the episodes. Returns
-    /// what each optimiser step saw. The first that is not finite is the last, and is not taken: `params`, optimiser and
-    /// normaliser are then as they were before it, in the midst of the update.
+    /// the losses of each optimiser step. Stops at the first step whose losses are not finite, without taking it: `params`,
+    /// optimiser and normaliser then hold the state after the steps before it, so the caller must restore them.
     pub fn update<R: Rng>(&mut self, batch: &[&Episode], stream: impl Fn(u64) -> R) -> Vec<Losses> {
         let said = self.said(batch);
         let targets = self.targets(batch, said);

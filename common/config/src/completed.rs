@@ -9,8 +9,8 @@ use crate::{
 use std::collections::BTreeMap;
 use toml::{Table, Value};
 
-/// These settings with those keys that have been added since, as was done before, so that what an older build wrote compares
-/// with what this one writes. Settings that this build does not know, or refuses, stay as they are.
+/// Adds the keys that did not exist when an older build wrote these settings, with the values that it behaved as if it had,
+/// so that they can be compared with settings of this build. Settings that this build refuses are returned unchanged.
 pub fn completed(mut settings: BTreeMap<String, String>) -> BTreeMap<String, String> {
     if let Some(bootstraps) = settings.remove(&format!("algorithm.{TIME_LIMIT_BOOTSTRAPS}")) {
         settings.insert("algorithm.time_limit".to_owned(), time_limit(bootstraps == "true").to_owned());

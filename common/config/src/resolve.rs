@@ -156,8 +156,8 @@ pub fn set(assignment: &str) -> Result<Table, ConfigError> {
     Ok(sections.fold(table, |table, section| Table::from_iter([(section.to_owned(), table.into())])))
 }
 
-/// The keys that somebody may have meant who wrote this name, such as an option that does not exist: all that are called
-/// so in their sections, or else the one most like it.
+/// Suggestions for a name that is no key, such as an unknown command-line option: every `section.key` whose last part is
+/// this name, or else the key most similar to it.
 pub fn keys_like(name: &str) -> Vec<String> {
     let Ok(defaults) = defaults() else { return Vec::new() };
     let called = keys::called(&name.replace('-', "_"), &defaults);

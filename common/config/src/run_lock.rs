@@ -14,14 +14,14 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// Who has the lock, a process and its host a line, the one that took it first. Where a file system locks no folders (NFS), the
-/// lock is on this file.
+/// The file that names the lock's holders: a line with process number and host for each, the first holder first. On file
+/// systems that cannot lock folders (NFS), this file is what is locked.
 pub(crate) const LOCK: &str = "lock";
 
-/// How long a run's processes are waited for whose first has died: they are about to end.
+/// How long to wait for the lock if its first holder has died: the processes that inherited it are about to end.
 const ORPHANS_TIMEOUT: Duration = Duration::from_secs(15);
 
-/// From one look whether they have to the next.
+/// Time between two attempts to take the lock meanwhile.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
 /// A run's lock. A process that writes to a run's directory has it, or was handed it by the process that started it.

@@ -81,8 +81,8 @@ pub enum FailureKind {
     TimedOut,
     /// Its process or connection is gone.
     Died,
-    /// It answered something that no environment of its task may: a wrong shape, a number that is none, an agent that may
-    /// do nothing.
+    /// It answered something that no environment of its task may: a wrong shape, a number that is not finite, an agent
+    /// without an available action.
     BadAnswer,
 }
 

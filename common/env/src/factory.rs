@@ -1,5 +1,5 @@
-//! Where worlds come from. Tasks of this crate are played in this process; all others, such as games across
-//! a network, is built above it.
+//! Where worlds come from. The worlds of this crate run in this process; factories for all others, such as games across
+//! a network, are in crates that depend on this one.
 
 use crate::{Environment, EnvironmentError, EnvironmentOptions, Spec, Task};
 

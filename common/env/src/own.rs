@@ -180,7 +180,7 @@ impl Held {
     /// The world of this task.
     pub(crate) fn make(maker: Maker, task: &str) -> Result<Self, EnvironmentError> {
         let world = held(|| Ok((maker.make)(task)))?;
-        let world = world.ok_or_else(|| bad(format!("the maker of {task:?} made it before, and no more")))?;
+        let world = world.ok_or_else(|| bad(format!("the maker no longer makes the task {task:?}, which it has made before")))?;
         Ok(Self { spec: world.spec(), world, seen: Observation::default(), steps: 0 })
     }
 

@@ -174,7 +174,8 @@ impl Rollout {
         rolled.into_iter().flatten().collect()
     }
 
-    /// Who acts together. Worlds that share a process were begun one after another, so each process has some of both halves.
+    /// Splits the episodes into groups that act together: all, or two halves if worlds step in other processes. Neighbours
+    /// share a process, so taking every other one gives each process worlds of both halves.
     fn groups(&self, running: Vec<Running>) -> Vec<Vec<Running>> {
         if !self.factory.steps_elsewhere() {
             return vec![running];
@@ -340,7 +341,8 @@ impl Running {
     }
 }
 
-/// Rounds in a row that may bring no episode at all where nobody says how many; then the environments do not work.
+/// Default of [`Rollout::with_lost_rounds_max`]: after so many rounds in a row that lost every episode, the environments
+/// count as broken.
 pub const LOST_ROUNDS_MAX: usize = 3;
 
 /// The episodes of jobs none of which was lost.

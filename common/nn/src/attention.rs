@@ -78,8 +78,8 @@ pub struct Sides<'a> {
     pub scale: f32,
 }
 
-/// Gradients by [`Sides`]: those by queries are written; those by keys and by values are added to where `adds` says so,
-/// else written too, which is possible only where each key has a row of its own.
+/// Gradients by [`Sides`]. The gradient by queries is overwritten. Those by keys and values are added to where `adds` is
+/// true and overwritten otherwise; overwriting is allowed only if no two keys share a row ([`Sides::rows`] is `None`).
 #[derive(Debug)]
 pub struct SidesMut<'a> {
     /// (Q, H k).
@@ -144,8 +144,8 @@ impl Attention {
         Sides { queries, keys, values, rows: None, heads: self.heads, scale: scale(self.head_dim()) }
     }
 
-    /// Makes gradients by values those by what stood before their ReLU, if they have one. `key_values` and their
-    /// gradients (K, 2a).
+    /// The ReLU's backward for the values, in place; does nothing if values stay linear. `key_values` and
+    /// `d_key_values` (K, 2a).
     pub fn rectify_backward(&self, key_values: View<'_>, d_key_values: ViewMut<'_>) {
         let a = self.dim;
         if self.values == Values::Rectified {

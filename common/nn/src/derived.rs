@@ -49,8 +49,8 @@ impl Derived {
         of
     }
 
-    /// x ↦ what each head's score is with by product of a key's x: with q = W_q x + b_q, score = q · W_k x' =
-    /// (W_kᵀ q) · x', so entities need no keys of their own. Its outputs are as wide as x for each head.
+    /// x ↦ W_kᵀ (W_q x + b_q), head by head, (inputs) → (heads · inputs). A head's score of an entity x' is the dot product
+    /// of this with x', because q · (W_k x') = (W_kᵀ q) · x': no keys have to be computed for entities.
     pub fn scores(&mut self, attention: &Attention) -> Linear {
         let (query, key, heads) = (attention.query.clone(), attention.key(), attention.heads);
         let of = self.layer(query.inputs, heads * key.inputs);

@@ -1,11 +1,11 @@
 //! A transformer's block over entity tokens and one recurrent token per agent (UPDeT): what an agent remembers is a
 //! token among those it sees.
 //!
-//! An agent's tokens are the entities it sees and its hidden token, which is what the block made of the hidden token
-//! one time before, zeros at first. Two of them ask: the agent's own, whose output is the block's, and the hidden
-//! token, whose output is the next one. Only the latter is recurrent; queries, keys and values of entities depend on
-//! neither agent nor time before, and the agents' own rows wait until all hidden tokens are there: both are products
-//! over all times at once.
+//! An agent's tokens are the entities it sees and its hidden token: the block's output for the hidden token one step
+//! before, zeros at the first step. Two tokens are queries: the agent's own entity, whose output is the block's output,
+//! and the hidden token, whose output is the next hidden token. Only the hidden token is recurrent. Entities' keys and
+//! values and the agents' own queries do not depend on it: they are computed for all steps at once before the
+//! recurrence. The own queries' attention reads the hidden tokens, so it follows for all steps at once afterwards.
 
 mod attend;
 
@@ -248,7 +248,7 @@ impl HiddenToken {
         for (x, d) in [(x, &d_entities), (u.rows(0..rows), &d_hidden)] {
             let d = View::dense(d, 2 * a);
             matmul::dyt_x(d, x, self.attention.key_value.weight_mut(grads), Accum::Add);
-            // The key's bias is no one's: see `Attention::project`.
+            // The key's bias has no gradient, because softmax cancels it: see `Attention::project_keys`.
             let bias = &mut self.attention.key_value.bias_mut(grads)[a..];
             linear::add_column_sums(d.columns(a..2 * a), bias);
         }
@@ -259,7 +259,7 @@ impl HiddenToken {
             d_x.reborrow(),
             Accum::Replace,
         );
-        // An agent's own x asks, and is added to what it is answered.
+        // An agent's own x is both the query and the residual that the attention's output is added to.
         let d_queries_own = View::dense(&d_queries[rows * a..], a);
         let d_own_u = ViewMut::dense(&mut d_u[rows * h..], h);
         matmul::dy_w(d_queries_own, self.attention.query.weight(params), d_own_u, Accum::Add);

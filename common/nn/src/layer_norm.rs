@@ -36,7 +36,7 @@ impl LayerNorm {
         normalize(x, &params[self.weight.clone()], &params[self.bias.clone()], y, moments);
     }
 
-    /// Both of the following.
+    /// [`Self::backward_params`], then [`Self::backward_input`] where `dx` is asked for.
     pub fn backward(
         &self,
         params: &[f32],

@@ -6,8 +6,8 @@ use rand::Rng;
 /// Numbers made at once.
 const CHUNK: usize = 256;
 
-/// Fills with independent standard normal numbers (Box and Muller). Two of them come of two draws of 32 bits, of which the
-/// last, where the number is odd, is not used.
+/// Fills with independent standard normal numbers (Box and Muller). Each pair of numbers takes two draws of 32 bits; if the
+/// length is odd, the second number of the last pair is discarded.
 pub fn fill_standard_normal(rng: &mut impl Rng, to: &mut [f32]) {
     let (mut radii, mut turns) = ([0.0; CHUNK / 2], [0.0; CHUNK / 2]);
     for to in to.chunks_mut(CHUNK) {

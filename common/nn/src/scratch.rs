@@ -9,7 +9,7 @@ pub struct Scratch {
     free: Vec<Vec<f32>>,
 }
 
-/// A slice that owns its memory, and more of it than it shows.
+/// An owned slice of length `len` whose allocation may be longer.
 #[derive(Clone, Debug, Default)]
 pub struct Buffer {
     memory: Vec<f32>,

@@ -15,7 +15,7 @@ pub struct Encoder {
     embed: Linear,
     /// Of agents over entities, a.
     attention: Attention,
-    /// x_k to what scores are made with, h → heads · h.
+    /// x_k ↦ W_kᵀ q, head by head: the vector whose dot product with x_j is a score. h → heads · h.
     scores: Linear,
     /// h → a, with ReLU.
     value: Linear,

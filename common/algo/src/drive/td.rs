@@ -48,7 +48,7 @@ pub struct ValueParts {
     pub gru: bool,
     /// How utilities become Q_total; a sum without it.
     pub mixer: Option<Mixer>,
-    /// Task representations and who tells them apart.
+    /// The task encoder, and the discriminator of the contrastive loss that trains it; `None` without representations.
     pub task: Option<(TaskEncoder, Discriminator)>,
 }
 
@@ -146,7 +146,7 @@ pub struct TdPass<'a, 'p, N: ValueNetwork> {
     pub extras: &'p N::Extras,
 }
 
-/// What an independent implementation can be compared with: values by the names of golden data.
+/// Intermediate values by name, for comparison with the golden data of an independent implementation.
 pub type Said = Vec<(&'static str, Var)>;
 
 /// A network that values actions: a method that learns by temporal differences.
@@ -190,7 +190,7 @@ pub trait ValueNetwork: Send + Sync + 'static {
     /// One pass over rows.
     fn forward<'a>(&self, tape: &mut Tape<'a>, pass: Pass<'a, Self::Inputs>) -> Utilities<'a, Self::Extras>;
 
-    /// What the TD loss counts beside the method's own losses.
+    /// Weight of the TD loss; the method's own losses carry their weights themselves.
     fn td_weight(&self) -> f32 {
         1.0
     }

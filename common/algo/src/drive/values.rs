@@ -18,8 +18,8 @@ pub struct EpisodeValues {
 }
 
 impl Model {
-    /// Values the joint actions `[T, n]`, each in the state that the episode has at its step; what agents remember is
-    /// that of the actions taken. None of a method without utilities, or whose passes draw random numbers.
+    /// Values the joint actions `[T, n]`, each in the episode's state at that step. The agents' memories are those of the
+    /// actions that were really taken. Returns `None` for methods without utilities, and for REFIL and ROMA.
     ///
     /// # Panics
     /// When `params` or `actions` are not as many as there are parameters or actions taken.

@@ -1,4 +1,4 @@
-//! ROMA's loss on the roles themselves: they should be sure of themselves, and told from what an agent went through.
+//! ROMA's loss on the roles: their entropy should be low, and their distribution predictable from the agent's history.
 //!
 //! L = softplus(w_H H + w_KL KL), H and KL means over all filled rows of Σ over dimensions.
 

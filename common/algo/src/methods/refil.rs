@@ -1,8 +1,8 @@
 //! REFIL: utilities, and a mixing network that also mixes imagined sub-groups of agents and entities.
 //!
 //! Entities are split into two groups at random, anew for each episode of each update. Besides the real pass, every agent
-//! goes through the episode twice more: seeing only its own group, and only the other one. What these two say of the
-//! actions taken is mixed as well, and has the TD target to meet.
+//! goes through the episode twice more: seeing only its own group, and only the other one. The utilities of the actions
+//! taken in these two passes are mixed to an imagined Q_total, which is trained towards the same TD target.
 
 use crate::{
     ModelConfig, Rows,

@@ -18,10 +18,10 @@ use rit_nn::{
 
 const MEASURES: [Measure; 9] = [
     measures::TD_LOSS,
-    Measure { name: "role_loss", help: "Loss of roles that are unsure or not told from the past" },
+    Measure { name: "role_loss", help: "Role loss: softplus of the weighted role entropy and divergence" },
     Measure { name: "role_entropy", help: "Mean entropy of roles" },
     Measure { name: "role_kl", help: "Mean divergence of roles from their posterior" },
-    Measure { name: "dissimilarity_loss", help: "Loss of roles that neither tell of each other nor differ" },
+    Measure { name: "dissimilarity_loss", help: "Loss of roles that are neither informative nor dissimilar" },
     measures::GRAD_NORM,
     measures::Q_TOTAL_MEAN,
     measures::TARGET_MEAN,
@@ -164,7 +164,8 @@ impl ValueNetwork for Roma {
         noise.collect()
     }
 
-    /// Who explores draws from its episode's stream; who does not has the mean as its role.
+    /// In training, roles are sampled with noise from the episode's stream; in evaluation the noise is zero, so an
+    /// agent's role is its distribution's mean.
     fn draw_acting(&self, turns: &mut [Turn<'_>]) -> RoleNoise {
         let noise = turns.iter_mut().map(|turn| {
             let len = turn.actions.len() * self.config.dim;
@@ -215,7 +216,7 @@ impl ValueNetwork for Roma {
             }
             return Utilities { memory, head, extras: None };
         }
-        // The posterior is told of the past and of the present, and neither is told of it.
+        // The posterior reads the history before this step and the present observation; its gradient reaches neither.
         let parts = [tape.detached_predecessors(memory, &rows.agent_times), tape.detach(shown)];
         let posterior = self.posterior.forward(tape, &parts);
         Utilities { memory, head, extras: Some(Roles { role, sample, posterior }) }

@@ -378,8 +378,8 @@ impl Translation {
         Some((ally.unit.tag, order))
     }
 
-    /// Takes the units after a step; a unit that is missing, or comes back as another, is dead. Returns what the step paid and whether the episode
-    /// has ended.
+    /// Takes the units after a step. A unit that is missing, or whose tag now has another side or type, is dead. Returns the
+    /// reward, and whether the episode has ended.
     pub fn advance(&mut self, units: &[RawUnit]) -> Step {
         self.steps += 1;
         let mut earned = 0.0;

@@ -319,7 +319,7 @@ impl World {
         true
     }
 
-    /// A unit dies at once, of nothing.
+    /// Kills a unit at once, without a hit: nothing is added to [`Self::lost`].
     pub fn kill(&mut self, unit: usize) {
         self.health[unit] = 0.0;
         self.bury_the_dead();

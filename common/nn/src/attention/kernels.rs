@@ -50,7 +50,7 @@ vectorized! {
                         *score = if sees { sides.scale * *score } else { f32::NEG_INFINITY };
                         largest = largest.max(*score);
                     }
-                    // Who sees nothing keeps −∞, which less itself is no number.
+                    // A query that sees no key keeps −∞ everywhere: −∞ − (−∞) would be NaN.
                     if largest > f32::NEG_INFINITY {
                         scores.iter_mut().for_each(|score| *score -= largest);
                     }
@@ -78,7 +78,7 @@ vectorized! {
                 let weights = take(&mut weights, group.pairs() * masks);
                 for weights in weights.chunks_exact_mut(group.keys.len()) {
                     let total: f32 = weights.iter().sum();
-                    // Who sees nothing keeps the zeros.
+                    // A query that sees no key has weights of zero: dividing by their sum would give NaN.
                     if total > 0.0 {
                         weights.iter_mut().for_each(|weight| *weight /= total);
                     }

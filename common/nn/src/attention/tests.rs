@@ -150,7 +150,7 @@ fn gradients(
     backward(state.sides(attention), &groups(), &state.weights, View::dense(d_out, DIM), d);
     let of_values = View::dense(&state.key_values, 2 * DIM);
     attention.rectify_backward(of_values, ViewMut::dense(&mut d_key_values, 2 * DIM));
-    // A key's bias is no one's.
+    // The key's bias has no gradient: softmax cancels it.
     for row in d_key_values.chunks_exact_mut(2 * DIM) {
         linear::add_column_sums(
             View::dense(&row[DIM..], DIM),

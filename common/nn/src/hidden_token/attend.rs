@@ -9,7 +9,7 @@ use crate::{
 };
 use std::ops::Range;
 
-/// Who asks and who is asked.
+/// The queries, and the tokens that they attend to.
 #[derive(Clone, Copy)]
 pub(super) struct Tokens<'a> {
     /// (R, a), one row for each of the groups' queries.

@@ -95,7 +95,7 @@ pub struct Over<'a> {
     pub rows: Option<&'a [usize]>,
     /// H.
     pub heads: usize,
-    /// What scores are scaled by one over the root of.
+    /// Width of one head's values, a / H: scores are divided by its square root.
     pub head_dim: usize,
 }
 

@@ -27,7 +27,7 @@ pub struct Totals {
     pub filled_agents: usize,
 }
 
-/// What of a shard lasts from one part of the update to the next.
+/// A shard's state that is kept between the parts of an update.
 #[derive(Default)]
 pub(super) struct Shard {
     pub(super) grads: Vec<f32>,

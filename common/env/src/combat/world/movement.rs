@@ -34,7 +34,8 @@ struct Intent {
 }
 
 impl World {
-    /// All units move from where everybody was, then bodies push, then the map ends.
+    /// Moves all units from their positions at the tick's start, then pushes overlapping bodies apart, then keeps all of them
+    /// on the map.
     pub(super) fn move_units(&mut self) {
         let count = self.len();
         self.moving.clear();
