@@ -1,7 +1,7 @@
 //! An actor: rolls the episodes it is leased and sends them to the learner, until either wants no more.
 //!
-//! [`run`] speaks gRPC on the runtime: leases come in, weights are watched. One thread of its own acts
-//! and sends; it takes other weights only between leases.
+//! [`run`] speaks gRPC on the runtime: leases come in, messages go out. One thread of its own fetches the weights that
+//! a lease names, acts and sends.
 
 mod losses;
 mod rollout;

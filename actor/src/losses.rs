@@ -1,11 +1,8 @@
 //! Episodes that an actor's environments lost: what the learner is told of them, and when the actor gives up.
 
 use rit_env::{FailureKind, rollout::LostEpisode};
-use rit_proto::v1;
+use rit_proto::{LOSS_DETAIL_CHARS_MAX, v1};
 use std::collections::BTreeMap;
-
-/// What the learner is told of a failure, in characters at most.
-const DETAIL_CHARS_MAX: usize = 500;
 
 /// The episodes of one lease that were lost.
 #[derive(Debug, Default)]
@@ -24,7 +21,7 @@ impl Losses {
             .entry(kind)
             .or_insert_with(|| v1::Loss { reason: kind.name().to_owned(), ..v1::Loss::default() });
         loss.episodes.push(lost.number);
-        loss.detail = format!("{}: {}", lost.task, lost.error).chars().take(DETAIL_CHARS_MAX).collect();
+        loss.detail = format!("{}: {}", lost.task, lost.error).chars().take(LOSS_DETAIL_CHARS_MAX).collect();
         self.last = Some(lost);
     }
 
@@ -82,7 +79,7 @@ mod tests {
             [("environment_timed_out", [4].as_slice()), ("environment_died", [3, 5].as_slice())]
         );
         assert_eq!(messages[0].detail, "3m: no answer");
-        assert_eq!(messages[1].detail.len(), DETAIL_CHARS_MAX);
+        assert_eq!(messages[1].detail.len(), LOSS_DETAIL_CHARS_MAX);
     }
 
     #[test]

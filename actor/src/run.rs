@@ -12,7 +12,7 @@ use rit_env::FailureKind;
 use rit_episode::wire::{self, PayloadLayout};
 use rit_ipc::{EpisodeSender, OpenError, RunSpace, RunSpaceError};
 use rit_proto::{
-    transport::{self, Address, AddressError, ConnectError, Credentials, status_words},
+    transport::{self, Address, AddressError, Client, ConnectError, Credentials, status_words},
     v1::{
         ActorMessage, Heartbeat, Hello, LearnerMessage, Lease, Leaving, Welcome, actor_message,
         learner_message, rollout_client::RolloutClient,
@@ -66,7 +66,7 @@ pub struct ActorOptions {
     pub name: String,
     /// The place that the supervisor of the learner's host fills with this actor, if one does.
     pub slot: Option<u32>,
-    /// Whether somebody sees to it that there is a learner, so that one that is away is waited for from the start.
+    /// Whether a supervisor starts the learner, so that one that is away is waited for from the start.
     pub supervised: bool,
 }
 
@@ -123,7 +123,7 @@ pub enum ActorError {
     /// The rollout thread could not be started.
     #[error("cannot start the rollout thread: {0}")]
     Thread(io::Error),
-    /// The rollout thread ended without a word.
+    /// The rollout thread panicked.
     #[error("the rollout thread panicked; this is a fault of the program, its message is in the log")]
     Panicked,
 }
@@ -248,66 +248,14 @@ impl Actor {
     ) -> Result<(), ActorError> {
         let (address, credentials) = self.learner.find()?;
         let client = transport::connect(&address, &credentials).await?;
-
-        let (outbox, messages) = mpsc::channel(OUTBOX);
-        let hello = Hello {
-            name: self.options.name.clone(),
-            pid: std::process::id(),
-            layout_version: wire::LAYOUT_VERSION,
-            instance: self.instance,
-            remote: matches!(self.learner, Learner::At(..)),
-            slot: self.options.slot,
-        };
-        outbox.try_send(say(actor_message::Message::Hello(hello))).map_err(|error| gone(&error))?;
-        let answer = RolloutClient::new(client.clone()).join(ReceiverStream::new(messages)).await;
-        let mut from_learner = answer.map_err(|status| refusal(&status))?.into_inner();
-        let welcome = from_learner.message().await.map_err(|status| refusal(&status))?;
-        let Some(learner_message::Message::Welcome(welcome)) = welcome.and_then(|message| message.message)
-        else {
-            return Err(gone(&"it did not say welcome"));
-        };
+        let (outbox, from_learner, welcome) = self.join(client.clone()).await?;
         *joined = true;
-        let Welcome { actor, run_id, config } = welcome;
-        let config: Config = resolve(&config, "the learner's configuration", &[])?;
-        rit_worlds::check(&config)?;
-        let layout = PayloadLayout::new(config.dims());
-
+        let actor = welcome.actor;
+        let stop = Arc::new(AtomicBool::new(false));
+        let roller = self.roller(client, welcome, Arc::clone(&stop)).await?;
         let (leases, lease_queue) = mpsc::channel(1);
         let (to_learner, from_roller) = mpsc::channel(1);
-        let stop = Arc::new(AtomicBool::new(false));
-        let model = Arc::new(Model::new(config.model())?);
-        let acting_bytes = size_of::<f32>() * model.acting().len();
-        let roller = Roller {
-            model,
-            rollout: Roller::rollout(&config),
-            sink: match &self.learner {
-                Learner::Here(run_dir) => {
-                    let path = run_dir.shared_memory();
-                    let place = read_text(&path).map_err(|error| gone(&error))?;
-                    let space = RunSpace::new(Path::new(place.trim_end()))?;
-                    let sender = EpisodeSender::open(&space, layout.len(), OPEN_TIMEOUT)?;
-                    EpisodeSink::SharedMemory(Box::new(sender))
-                }
-                Learner::At(..) => {
-                    let stream = FrameStream::open(client.clone()).await;
-                    EpisodeSink::Stream(stream.map_err(|status| refusal(&status))?)
-                }
-            },
-            layout,
-            run_id: run_id.try_into().map_err(|_| ActorError::RunId)?,
-            actor,
-            lost_leases: LostLeases::new(config.environment.lost_rounds_max),
-            weights: Weights::new(client, acting_bytes),
-            stop: Arc::clone(&stop),
-        };
-        let (result, mut rolled) = oneshot::channel();
-        let runtime = tokio::runtime::Handle::current();
-        thread::Builder::new()
-            .name("rollout".into())
-            .spawn(move || {
-                let _ = result.send(roller.run(&runtime, lease_queue, &to_learner));
-            })
-            .map_err(ActorError::Thread)?;
+        let mut rolled = start(roller, lease_queue, to_learner)?;
         tracing::info!(actor, %address, "joined");
 
         let conversation = converse(from_learner, outbox, leases, from_roller, leaving);
@@ -330,12 +278,95 @@ impl Actor {
             _ => ended,
         }
     }
+
+    /// Says Hello, and waits for the answer.
+    async fn join(&self, client: Client) -> Result<(Outbox, Streaming<LearnerMessage>, Welcome), ActorError> {
+        let (outbox, messages) = mpsc::channel(OUTBOX);
+        let hello = Hello {
+            name: self.options.name.clone(),
+            pid: std::process::id(),
+            layout_version: wire::LAYOUT_VERSION,
+            instance: self.instance,
+            remote: matches!(self.learner, Learner::At(..)),
+            slot: self.options.slot,
+        };
+        outbox.try_send(say(actor_message::Message::Hello(hello))).map_err(|error| gone(&error))?;
+        let answer = RolloutClient::new(client).join(ReceiverStream::new(messages)).await;
+        let mut from_learner = answer.map_err(|status| refusal(&status))?.into_inner();
+        let welcome = from_learner.message().await.map_err(|status| refusal(&status))?;
+        match welcome.and_then(|message| message.message) {
+            Some(learner_message::Message::Welcome(welcome)) => Ok((outbox, from_learner, welcome)),
+            _ => Err(gone(&"it did not say welcome")),
+        }
+    }
+
+    /// What rolls the learner's episodes, until `stop` is set.
+    async fn roller(
+        &self,
+        client: Client,
+        welcome: Welcome,
+        stop: Arc<AtomicBool>,
+    ) -> Result<Roller, ActorError> {
+        let Welcome { actor, run_id, config } = welcome;
+        let config: Config = resolve(&config, "the learner's configuration", &[])?;
+        rit_worlds::check(&config)?;
+        let layout = PayloadLayout::new(config.dims());
+        let model = Arc::new(Model::new(config.model())?);
+        let acting_bytes = size_of::<f32>() * model.acting().len();
+        Ok(Roller {
+            model,
+            rollout: Roller::rollout(&config),
+            sink: self.sink(&client, &layout).await?,
+            layout,
+            run_id: run_id.try_into().map_err(|_| ActorError::RunId)?,
+            actor,
+            lost_leases: LostLeases::new(config.environment.lost_rounds_max),
+            weights: Weights::new(client, acting_bytes),
+            stop,
+        })
+    }
+
+    /// Where its episodes go.
+    async fn sink(&self, client: &Client, layout: &PayloadLayout) -> Result<EpisodeSink, ActorError> {
+        match &self.learner {
+            Learner::Here(run_dir) => {
+                let path = run_dir.shared_memory();
+                let place = read_text(&path).map_err(|error| gone(&error))?;
+                let space = RunSpace::new(Path::new(place.trim_end()))?;
+                let sender = EpisodeSender::open(&space, layout.len(), OPEN_TIMEOUT)?;
+                Ok(EpisodeSink::SharedMemory(Box::new(sender)))
+            }
+            Learner::At(..) => {
+                let stream = FrameStream::open(client.clone()).await;
+                Ok(EpisodeSink::Stream(stream.map_err(|status| refusal(&status))?))
+            }
+        }
+    }
+}
+
+/// Messages on their way to the learner.
+type Outbox = mpsc::Sender<ActorMessage>;
+
+/// Starts the rollout thread; returns the way to its result.
+fn start(
+    roller: Roller,
+    leases: mpsc::Receiver<Lease>,
+    to_learner: mpsc::Sender<actor_message::Message>,
+) -> Result<oneshot::Receiver<Result<(), RolloutError>>, ActorError> {
+    let (result, rolled) = oneshot::channel();
+    let runtime = tokio::runtime::Handle::current();
+    let started = thread::Builder::new().name("rollout".into()).spawn(move || {
+        // The session may have ended.
+        let _ = result.send(roller.run(&runtime, leases, &to_learner));
+    });
+    started.map_err(ActorError::Thread)?;
+    Ok(rolled)
 }
 
 /// Passes leases on and says what the rollout thread has to say, until farewell.
 async fn converse(
     mut from_learner: Streaming<LearnerMessage>,
-    outbox: mpsc::Sender<ActorMessage>,
+    outbox: Outbox,
     leases: mpsc::Sender<Lease>,
     mut from_roller: mpsc::Receiver<actor_message::Message>,
     leaving: &mut watch::Receiver<bool>,

@@ -50,8 +50,8 @@ impl EpisodeSink {
         }
     }
 
-    /// Waits until whatever is told to the learner from now on comes after the frames sent. In shared memory that
-    /// is so by itself: the learner reads it before it takes up what it is told.
+    /// Waits until what is told to the learner from now on comes after the frames sent. In shared memory that is so
+    /// by itself: the learner reads it before it takes up what it is told.
     pub(crate) fn flush(&mut self, give_up: &dyn Fn() -> bool) -> Result<(), SinkError> {
         match self {
             Self::SharedMemory(_) => Ok(()),

@@ -216,8 +216,11 @@ pub fn save(
     symlink(&name, &new_link).and_then(|()| fs::rename(&new_link, &link)).map_err(io(&link))?;
     sync(&all)?;
     written::remember(run_dir, &state.manifest.origin, &name)?;
-    if let Some(folder) = folders::named(&all, &name) {
-        folders::forget_old(&all, &folder, keep)?;
+    // This one is whole and remembered: older ones that cannot be removed do not make it a failure.
+    if let Some(folder) = folders::named(&all, &name)
+        && let Err(error) = folders::forget_old(&all, &folder, keep)
+    {
+        tracing::warn!(%error, "old checkpoints stay until the next one");
     }
     Ok(Path::new("checkpoints").join(name))
 }
@@ -261,8 +264,10 @@ fn write(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
     written.map_err(io(path))
 }
 
-/// Writes a small file anew: it is the old one or the new one at every moment.
-fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
+/// Writes a small file anew: it is the old one or the new one at every moment, and the new one is on disk after this.
+/// Unlike those of [`rit_config::write_whole`], it can be read by everyone who can read the rest of a checkpoint, and a folder
+/// that cannot be synced is an error.
+fn write_durably(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
     let partial = path.with_extension(PARTIAL);
     write(&partial, bytes)?;
     fs::rename(&partial, path).map_err(io(path))?;
@@ -314,7 +319,7 @@ fn load(
     manifest.check(tasks, algorithm).map_err(|what| inconsistent(MANIFEST, what))?;
     let weights = |name: &str, digest: &String| {
         read_checked(folder, name)?;
-        let params = weights_file::load(&folder.join(name), learner.model().layout())?;
+        let params = weights_file::load(&folder.join(name), learner.layout())?;
         if weights_file::digest(&params) != *digest {
             return Err(inconsistent(name, format!("its weights are not those that {MANIFEST} names")));
         }
@@ -345,7 +350,7 @@ fn load(
     }
     let mut snapshots = Vec::new();
     for SnapshotMark { version, env_steps } in &manifest.snapshots {
-        let params = tensor(&snapshot_name(*version), Dtype::F32, learner.model().acting().len())?;
+        let params = tensor(&snapshot_name(*version), Dtype::F32, learner.acting().len())?;
         snapshots.push(Snapshot { version: *version, env_steps: *env_steps, params: params.into() });
     }
     Ok(TrainingState { params, best, learner: state, snapshots, manifest })

@@ -163,9 +163,7 @@ impl From<AskError> for Status {
             | AskError::Episodes(_)
             | AskError::Setting(_)
             | AskError::Log(_) => Self::invalid_argument(message),
-            AskError::Checkpoint(_) | AskError::Rollout(_) | AskError::RunDir(_) | AskError::Lost(_) => {
-                Self::internal(message)
-            }
+            AskError::Checkpoint(_) | AskError::Panicked(_) | AskError::Lost(_) => Self::internal(message),
         }
     }
 }

@@ -1,7 +1,7 @@
 //! Between actors, trainer and callers: hands out leases, takes episodes in, answers for the run's state.
 //!
 //! A state machine that owns the ledger and the list of actors: it is told what happened and at what time, and answers
-//! with what is to be done. Channels, clocks and connections are its [`Shell`]'s, which everybody else sends
+//! with what is to be done. Channels, clocks and connections are its [`Shell`]'s, which all other tasks send
 //! [`Event`]s. It never waits for the trainer or for an actor, so a slow one holds up no other. `rit soak --simulated`
 //! drives this very code.
 
@@ -15,7 +15,7 @@ mod status;
 
 use crate::{
     gauges::{Checkpoints, Happenings, RateWindow, Stopwatch},
-    ledger::{ActorId, Counts, Lease, Ledger, Reason},
+    ledger::{ActorId, Counts, Lease, Ledger, Reason, Terms},
     receive::Fence,
     trainer::{Beginning, News, Standing},
     writer::CheckpointEnded,
@@ -189,7 +189,8 @@ impl Coordinator {
         self.ledger.counts()
     }
 
-    /// Who waits for whom. No one does while the run is paused or ending.
+    /// Times training that waits for actors, and actors that wait for training; neither does while the run is paused or
+    /// ending.
     fn time_waits(&mut self) {
         let (now, running) = (self.now, self.state == State::Running);
         self.learner_waiting.set(running && self.batches_in_training == 0, now);
@@ -229,7 +230,7 @@ impl Coordinator {
         self.happenings.note(self.now, self.standing.progress.env_steps, what);
     }
 
-    /// What somebody should know of.
+    /// Notes a warning: `rit train` prints it, the page shows it.
     fn warned(&mut self, what: String) {
         self.happenings.warn(self.now, self.standing.progress.env_steps, what);
     }
@@ -245,49 +246,13 @@ impl Coordinator {
                 *self.frames_refused.entry(reason).or_default() += 1;
             }
             Input::Join(joining) => self.join(joining, effects),
-            Input::Done(actor, lease, losses) => {
-                self.heard(actor, effects);
-                if self.has_outstanding(actor, lease) {
-                    self.take_losses(actor, losses, effects);
-                }
-                // Not all of it has come through yet, or a frame was refused: look again once all that was
-                // sent before has been read.
-                if self.has_outstanding(actor, lease) {
-                    effects.push(Effect::Fence(Fence { actor, lease }));
-                }
-            }
-            Input::Fenced(Fence { actor, lease }) => {
-                if self.has_outstanding(actor, lease) {
-                    let missing = self.ledger.take_back(actor, Reason::NotArrived);
-                    tracing::warn!(actor, missing, "episodes did not arrive and are handed out again");
-                    self.happened(format!("{missing} episodes did not arrive and are handed out again"));
-                    self.part_if_done(actor, effects);
-                    self.hand_out(effects);
-                }
-            }
+            Input::Done(actor, lease, losses) => self.done(actor, lease, losses, effects),
+            Input::Fenced(fence) => self.fenced(fence, effects),
             Input::Heartbeat(actor) => self.heard(actor, effects),
-            Input::Leaving(actor) => {
-                self.heard(actor, effects);
-                if let Some(leaving) = self.actors.get_mut(&actor) {
-                    leaving.leaving = true;
-                }
-                self.part_if_done(actor, effects);
-            }
+            Input::Leaving(actor) => self.leaving(actor, effects),
             Input::Gone(actor) => self.gone(actor, effects),
             Input::PlaceLost(notice) => self.place_lost(notice, effects),
-            Input::News(News::Trained(terms, standing)) => {
-                self.moved();
-                self.ledger.open(terms);
-                self.epsilon = terms.epsilon;
-                self.batches_in_training = self.batches_in_training.saturating_sub(1);
-                let evaluated_at = |standing: &Standing| standing.evaluation.as_ref().map(|(at, _)| *at);
-                let evaluated = evaluated_at(&standing) != evaluated_at(&self.standing);
-                self.standing = standing;
-                if evaluated && let Some((_, results)) = &self.standing.evaluation {
-                    self.happened(format!("evaluated: {}", in_words(results)));
-                }
-                self.hand_out(effects);
-            }
+            Input::News(News::Trained(terms, standing)) => self.trained(terms, standing, effects),
             Input::News(News::Warning(what)) => self.warned(what),
             Input::News(News::Ending) => self.state = State::Stopping,
             Input::CheckpointEnded(ended) => self.checkpoint_ended(ended),
@@ -298,6 +263,51 @@ impl Coordinator {
             Input::Look => self.look(effects),
             Input::Over => self.part_with_actors(effects),
         }
+    }
+
+    fn done(&mut self, actor: ActorId, lease: u64, losses: Vec<Loss>, effects: &mut Vec<Effect>) {
+        self.heard(actor, effects);
+        if self.has_outstanding(actor, lease) {
+            self.take_losses(actor, losses, effects);
+        }
+        // Not all of it has come through yet, or a frame was refused: look again once all that was sent before has
+        // been read.
+        if self.has_outstanding(actor, lease) {
+            effects.push(Effect::Fence(Fence { actor, lease }));
+        }
+    }
+
+    fn fenced(&mut self, Fence { actor, lease }: Fence, effects: &mut Vec<Effect>) {
+        if self.has_outstanding(actor, lease) {
+            let missing = self.ledger.take_back(actor, Reason::NotArrived);
+            tracing::warn!(actor, missing, "episodes did not arrive and are handed out again");
+            self.happened(format!("{missing} episodes did not arrive and are handed out again"));
+            self.part_if_done(actor, effects);
+            self.hand_out(effects);
+        }
+    }
+
+    fn leaving(&mut self, id: ActorId, effects: &mut Vec<Effect>) {
+        self.heard(id, effects);
+        if let Some(actor) = self.actors.get_mut(&id) {
+            actor.leaving = true;
+        }
+        self.part_if_done(id, effects);
+    }
+
+    /// A batch is done, and another may be rolled on these terms.
+    fn trained(&mut self, terms: Terms, standing: Standing, effects: &mut Vec<Effect>) {
+        self.moved();
+        self.ledger.open(terms);
+        self.epsilon = terms.epsilon;
+        self.batches_in_training = self.batches_in_training.saturating_sub(1);
+        let evaluated_at = |standing: &Standing| standing.evaluation.as_ref().map(|(at, _)| *at);
+        let evaluated = evaluated_at(&standing) != evaluated_at(&self.standing);
+        self.standing = standing;
+        if evaluated && let Some((_, results)) = &self.standing.evaluation {
+            self.happened(format!("evaluated: {}", in_words(results)));
+        }
+        self.hand_out(effects);
     }
 
     fn checkpoint_ended(&mut self, CheckpointEnded { env_steps, duration, failed }: CheckpointEnded) {
@@ -420,7 +430,7 @@ impl Coordinator {
         }
     }
 
-    /// The end of the run: takes back what is outstanding and lets everybody go.
+    /// The end of the run: takes outstanding leases back and tells all actors to end.
     fn part_with_actors(&mut self, effects: &mut Vec<Effect>) {
         if self.over_since.is_some() {
             return;

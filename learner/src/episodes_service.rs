@@ -39,8 +39,8 @@ impl episodes_server::Episodes for EpisodesService {
         tokio::spawn(async move {
             // The next frame is read when the coordinator has taken the one before: so long the actor waits.
             while let Ok(Some(Frame { header, payload })) = frames.message().await {
-                let event = receive::read(Header::from_bytes(&header), &payload, &expected);
-                if events.send(event).await.is_err() {
+                let input = receive::read(Header::from_bytes(&header), &payload, &expected);
+                if events.send(input.into()).await.is_err() {
                     return;
                 }
                 count.send_modify(|frames| *frames += 1);

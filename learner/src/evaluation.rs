@@ -351,7 +351,7 @@ mod tests {
     }
 
     #[test]
-    fn what_nobody_wants_any_more_ends_within_a_few_episodes() {
+    fn a_cancelled_evaluation_ends_within_a_few_episodes() {
         let config = rit_config::resolve("environment.task_set = \"matrix-game\"", "test", &[]).unwrap();
         let evaluator = Evaluator::new(&config);
         let tasks = evaluator.tasks(&[]).unwrap();
@@ -408,7 +408,7 @@ mod tests {
     }
 
     #[test]
-    fn whoever_watches_sees_the_episodes_that_are_measured() {
+    fn watched_episodes_are_those_that_are_measured() {
         let config = rit_config::resolve("environment.task_set = \"predator-prey\"", "test", &[]).unwrap();
         let evaluator = Evaluator::new(&config);
         let task = evaluator.tasks(&["predator-prey-3-2".into()]).unwrap()[0];

@@ -103,7 +103,7 @@ pub struct Happening {
     pub env_steps: u64,
     /// In words.
     pub what: String,
-    /// Somebody should know of it.
+    /// Whether it is a warning.
     pub warning: bool,
 }
 
@@ -119,7 +119,7 @@ impl Happenings {
         self.push(now, env_steps, what, false);
     }
 
-    /// Remembers what somebody should know of: it stays when what is no warning is forgotten.
+    /// Remembers a warning: it is kept when older ordinary entries are dropped.
     pub fn warn(&mut self, now: Duration, env_steps: u64, what: String) {
         self.push(now, env_steps, what, true);
     }

@@ -323,7 +323,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ledger_goes_on_behind_what_is_done() {
+    fn a_ledger_continues_after_what_is_done() {
         let mut ledger = Ledger::new(2, 5, vec![terms(4), terms(5)]);
         assert_eq!(ledger.lease(1, 9), Some(Lease { episodes: vec![10, 11], terms: terms(4) }));
         assert_eq!(ledger.lease(1, 9), Some(Lease { episodes: vec![12, 13], terms: terms(5) }));
@@ -371,7 +371,7 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever happens in whatever order: every number enters training exactly once, in order, with the
+        /// In whichever order things happen, every number enters training exactly once, in order, with the
         /// version its batch was given, and the counts balance.
         #[test]
         fn every_episode_enters_exactly_once_and_in_order(

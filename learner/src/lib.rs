@@ -10,6 +10,7 @@ pub mod checkpoint;
 pub mod control_service;
 pub mod coordinator;
 pub mod cpu_time;
+mod damaged;
 pub mod episodes_service;
 pub mod evaluation;
 pub mod gauges;

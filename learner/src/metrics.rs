@@ -11,7 +11,7 @@ use rit_record::{Exploring, Header, Line, TaskResult, is_header};
 use std::{
     collections::VecDeque,
     fs::OpenOptions,
-    io::{self, Read as _, Seek as _, SeekFrom},
+    io::{self, Read, Seek as _, SeekFrom},
     path::{Path, PathBuf},
     time::Instant,
 };
@@ -20,8 +20,11 @@ use tokio::sync::watch;
 /// Episodes of each task that count as of late.
 pub const RECENT: usize = 100;
 
-/// Bytes that a follower of the file reads at a time: far more than a line has.
+/// Bytes that a follower of the file reads at a time: far more than most lines have.
 const CHUNK: u64 = 1 << 20;
+
+/// The longest line that a follower reads: one of an evaluation of very many episodes is longer than a chunk.
+const LINE_BYTES_MAX: u64 = 1 << 28;
 
 /// How exploring episodes of each training task went of late.
 #[derive(Debug)]
@@ -108,8 +111,8 @@ pub struct MetricsFile {
 
 impl MetricsFile {
     /// Begins the file, or goes on after the `end` that a checkpoint remembers: what comes after it was written by a
-    /// learner that died, and will be written again. `before_s` are the seconds that learners ran before. Returns what
-    /// somebody should know of it too, if it had to be repaired.
+    /// learner that died, and will be written again. `before_s` are the seconds that learners ran before. Also returns a
+    /// warning if it had to be repaired.
     ///
     /// # Errors
     /// When it is of another run or build, or cannot be written.
@@ -145,7 +148,7 @@ impl MetricsFile {
         self.len() == 0
     }
 
-    /// Somebody who reads all its lines, from the first.
+    /// A reader of all its lines, from the first.
     pub fn follower(&self) -> Follower {
         Follower { path: self.path.clone(), at: 0, len: self.len.subscribe() }
     }
@@ -192,9 +195,7 @@ impl Follower {
         let len = *self.len.borrow_and_update();
         let mut file = open_regular(&self.path, OpenOptions::new().read(true))?;
         file.seek(SeekFrom::Start(self.at))?;
-        let mut text = Vec::new();
-        file.take(CHUNK.min(len.saturating_sub(self.at))).read_to_end(&mut text)?;
-        let whole = text.iter().rposition(|&byte| byte == b'\n').map_or(0, |at| at + 1);
+        let (text, whole) = read_lines(&mut file.take(len.saturating_sub(self.at)), LINE_BYTES_MAX)?;
         self.at += whole as u64;
         let lines =
             text[..whole].split(|&byte| byte == b'\n').filter(|line| !line.is_empty() && !is_header(line));
@@ -214,6 +215,27 @@ impl Follower {
     /// Waits for further lines; `false` when there will be none, since the writer has gone.
     pub async fn more(&mut self) -> bool {
         self.len.changed().await.is_ok()
+    }
+}
+
+/// The next chunk, or as many as it takes to come to the end of a line; and how many bytes of it are whole lines.
+fn read_lines(file: &mut impl Read, line_bytes_max: u64) -> io::Result<(Vec<u8>, usize)> {
+    let mut text = Vec::new();
+    loop {
+        let before = text.len();
+        file.by_ref().take(CHUNK).read_to_end(&mut text)?;
+        if let Some(at) = text[before..].iter().rposition(|&byte| byte == b'\n') {
+            return Ok((text, before + at + 1));
+        }
+        if text.len() == before {
+            return Ok((text, 0));
+        }
+        if text.len() as u64 > line_bytes_max {
+            let words = format!(
+                "a line has more than {line_bytes_max} bytes; set evaluation.episodes lower, so that lines are shorter"
+            );
+            return Err(io::Error::new(io::ErrorKind::FileTooLarge, words));
+        }
     }
 }
 
@@ -277,5 +299,34 @@ mod tests {
         drop(metrics);
         assert!(!follower.more().await);
         assert!(read.into_iter().eq(0..=many));
+    }
+
+    #[test]
+    fn a_line_longer_than_what_is_read_at_a_time_holds_up_no_reader() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let mut metrics = open(file.path(), None, 0.0);
+        let mut long = line(2);
+        let Line::Training(point) = &mut long else { panic!("{long:?}") };
+        point.tasks.insert("x".repeat(3 * CHUNK as usize), TaskResult::default());
+        for written in [&line(1), &long, &line(3)] {
+            metrics.write(written).unwrap();
+        }
+        let mut follower = metrics.follower();
+        let mut read = Vec::new();
+        while follower.at() < metrics.len() {
+            let lines = follower.read().unwrap();
+            assert!(!lines.is_empty(), "it stays at {}", follower.at());
+            read.extend(lines.iter().map(|line| line.progress().unwrap().env_steps));
+        }
+        assert_eq!(read, [1, 2, 3]);
+    }
+
+    #[test]
+    fn a_line_that_never_ends_is_refused() {
+        let endless = read_lines(&mut io::repeat(b'x'), 2 * CHUNK).unwrap_err();
+        assert!(endless.to_string().contains("a line has more than 2097152 bytes"), "{endless}");
+        let whole = |text: &[u8]| read_lines(&mut &text[..], 2 * CHUNK).unwrap();
+        assert_eq!(whole(b"{}\n{\"half"), (b"{}\n{\"half".to_vec(), 3));
+        assert_eq!(whole(b"{\"half"), (b"{\"half".to_vec(), 0));
     }
 }

@@ -1,5 +1,6 @@
 //! What a learner finds of `metrics.jsonl` when it goes on: lines that are whole are kept, and what is not is said.
 
+use crate::damaged;
 use rit_config::open_regular;
 use rit_record::{Header, OtherFile, is_header};
 use serde::{Deserialize, de::IgnoredAny};
@@ -41,7 +42,7 @@ struct Any {
 
 impl Any {
     /// Whether a learner that goes on from a checkpoint at so many steps will come to this line again.
-    fn is_behind(&self, env_steps: u64) -> bool {
+    fn is_after(&self, env_steps: u64) -> bool {
         self.env_steps > env_steps || self.occasion.is_some()
     }
 }
@@ -88,7 +89,7 @@ impl Lines {
                 continue;
             }
             match serde_json::from_slice::<Any>(&line) {
-                Ok(any) if any.is_behind(until_env_steps) => return Ok(lines),
+                Ok(any) if any.is_after(until_env_steps) => return Ok(lines),
                 Ok(any) if line.ends_with(b"\n") => {
                     (lines.broken, lines.last) = (lines.broken + broken_since, any.env_steps);
                     broken_since = 0;
@@ -164,10 +165,12 @@ pub fn repair(path: &Path, header: &Header, end: End) -> Result<(u64, Option<Str
 
 /// Writes the file anew, of a first line and these ranges; keeps the old one beside it. Returns where.
 fn rewrite(path: &Path, first: &[u8], ranges: &[Range<u64>]) -> io::Result<PathBuf> {
-    let numbers = std::iter::once(String::new()).chain((2..100).map(|number| format!("-{number}")));
-    let mut places = numbers.map(|number| path.with_extension(format!("jsonl.damaged{number}")));
-    let damaged = places.find(|place| fs::symlink_metadata(place).is_err());
-    let damaged = damaged.ok_or_else(|| io::Error::other("there are 99 damaged ones beside it already"))?;
+    let damaged = damaged::free_place(path).ok_or_else(|| {
+        io::Error::other(format!(
+            "{} damaged ones of this name lie beside it already; move them away",
+            damaged::KEPT_MAX
+        ))
+    })?;
     let partial = path.with_extension("jsonl.partial");
     let mut options = OpenOptions::new();
     let mut to = open_regular(&partial, options.write(true).create(true).truncate(true).mode(0o600))?;
@@ -222,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_dead_learner_wrote_last_goes_without_a_word() {
+    fn what_a_dead_learner_wrote_last_goes_without_a_warning() {
         let kept = &whole()[..end().len as usize];
         assert_eq!(repaired(&whole()), (kept.to_owned(), None));
         assert_eq!(
@@ -234,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_measured_at_a_former_end_goes_without_a_word() {
+    fn what_was_measured_at_a_former_end_goes_without_a_warning() {
         let kept = &whole()[..end().len as usize];
         let at_the_end = line(20).replace("\"td_loss\"", "\"occasion\":\"final\",\"td_loss\"");
         let best = at_the_end.replace(":20", ":10").replace("final", "best");

@@ -70,7 +70,7 @@ fn write(out: &mut MetricEncoder<'_>, kind: MetricType, value: f64) -> fmt::Resu
     }
 }
 
-/// Names of actors are whatever somebody typed, and the encoder writes label values as they are.
+/// Names may hold any characters, and the encoder writes label values as they are.
 fn escaped(text: &str) -> String {
     text.replace('\\', r"\\").replace('"', r#"\""#).replace('\n', r"\n")
 }

@@ -87,7 +87,7 @@ pub struct ReplayLog {
 }
 
 impl ReplayLog {
-    /// Goes on after episode `next` − 1: whatever comes after it is cut off.
+    /// Goes on after episode `next` − 1: what comes after it is cut off.
     ///
     /// # Errors
     /// When the folder cannot be made or cut.
@@ -266,7 +266,7 @@ fn path(folder: &Path, first: u64) -> PathBuf {
     folder.join(format!("{first:012}.frames"))
 }
 
-/// The first numbers of the files there are. What is not called like one of ours is somebody else's.
+/// The first numbers of the files there are. What is not called like one of ours is not ours.
 fn files(folder: &Path) -> io::Result<Vec<u64>> {
     let mut firsts = Vec::new();
     for entry in fs::read_dir(folder)? {

@@ -1,11 +1,14 @@
 //! `rit.v1.Rollout`: turns an actor's stream into events.
 
 use crate::{
-    coordinator::{ACTOR_QUEUE, Event, Loss},
+    coordinator::{ACTOR_QUEUE, Event, Input, Loss},
     cpu_time::CpuTime,
 };
 use rit_env::FailureKind;
-use rit_proto::v1::{self, ActorMessage, LearnerMessage, actor_message::Message, rollout_server};
+use rit_proto::{
+    LOSS_DETAIL_CHARS_MAX,
+    v1::{self, ActorMessage, LearnerMessage, actor_message::Message, rollout_server},
+};
 use std::{pin::Pin, sync::Arc};
 use tokio::sync::{mpsc, oneshot};
 use tokio_stream::{Stream, wrappers::ReceiverStream};
@@ -35,14 +38,11 @@ fn check_name(name: &str) -> Result<(), Status> {
     )))
 }
 
-/// What an actor says of a failure is shown to people: in characters at most.
-const DETAIL_CHARS_MAX: usize = 1000;
-
 /// What was lost, for the reasons that there are: episodes of others are missed when all that was sent has been read.
 fn losses(losses: Vec<v1::Loss>) -> Vec<Loss> {
     let loss = |v1::Loss { reason, episodes, detail }| {
         let kind = FailureKind::ALL.into_iter().find(|kind| kind.name() == reason)?;
-        Some(Loss { kind, episodes, detail: detail.chars().take(DETAIL_CHARS_MAX).collect() })
+        Some(Loss { kind, episodes, detail: detail.chars().take(LOSS_DETAIL_CHARS_MAX).collect() })
     };
     losses.into_iter().filter_map(loss).collect()
 }
@@ -71,23 +71,23 @@ impl rollout_server::Rollout for RolloutService {
         tokio::spawn(async move {
             // A message, the end, or an error: what is no message ends the actor's time here.
             while let Ok(Some(message)) = messages.message().await {
-                let event = match message.message {
+                let input = match message.message {
                     Some(Message::Done(done)) => {
                         cpu.note(instance, done.cpu_ms);
-                        Event::Done(actor, done.lease, losses(done.losses))
+                        Input::Done(actor, done.lease, losses(done.losses))
                     }
-                    Some(Message::Leaving(_)) => Event::Leaving(actor),
+                    Some(Message::Leaving(_)) => Input::Leaving(actor),
                     Some(Message::Heartbeat(heartbeat)) => {
                         cpu.note(instance, heartbeat.cpu_ms);
-                        Event::Heartbeat(actor)
+                        Input::Heartbeat(actor)
                     }
                     Some(Message::Hello(_)) | None => continue,
                 };
-                if events.send(event).await.is_err() {
+                if events.send(input.into()).await.is_err() {
                     return;
                 }
             }
-            let _ = events.send(Event::Gone(actor)).await;
+            let _ = events.send(Input::Gone(actor).into()).await;
         });
         Ok(Response::new(Box::pin(ReceiverStream::new(from_learner))))
     }

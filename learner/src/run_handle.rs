@@ -1,14 +1,14 @@
 //! What callers ask of a running learner, whichever way they come: the gRPC service and the web page share it.
 
 use crate::{
-    coordinator::{Control, Event},
+    coordinator::{Control, Event, Input},
     evaluation::{Evaluator, TasksError},
     messages,
-    trainer::{Checkpointed, evaluation_seed},
+    trainer::{Checkpointed, News, evaluation_seed},
     weights::{Snapshot, WeightsBoard},
 };
 use rit_algo::{Acting, Model, learner::Measure};
-use rit_config::{Config, ConfigError, RunDir, RunDirError, set, set_live, write_whole};
+use rit_config::{Config, ConfigError, RunDir, set, set_live, write_whole};
 use rit_env::{EnvironmentFactory, Scene, TaskError, rollout::LostEpisode};
 use rit_episode::{Episode, RunSeed};
 use rit_proto::v1;
@@ -23,6 +23,7 @@ use tokio::{
     sync::{Mutex, Semaphore, mpsc, oneshot, watch},
     task::JoinError,
 };
+use tracing::Instrument as _;
 
 /// Most episodes of each task that one evaluation rolls.
 pub const EPISODES_MAX: u32 = 1_000_000;
@@ -57,18 +58,15 @@ pub enum AskError {
     /// A filter for logs that means nothing.
     #[error("log: {0}")]
     Log(String),
-    /// The settings were not written down.
-    #[error(transparent)]
-    RunDir(#[from] RunDirError),
     /// The checkpoint was not written.
     #[error("{0}")]
     Checkpoint(String),
     /// Others wait for their turn.
     #[error("{WAITING_MAX} evaluations are under way or wait for their turn; try again later")]
     Busy,
-    /// The episodes were not rolled to their end.
-    #[error("the evaluation failed: {0}")]
-    Rollout(#[from] JoinError),
+    /// What was to be done panicked.
+    #[error("it was not done: {0}; this is a fault of the program, its message is in the log")]
+    Panicked(#[from] JoinError),
 }
 
 /// One greedy episode, and what could be seen of it.
@@ -149,11 +147,17 @@ impl RunHandle {
         Arc::clone(&self.config.borrow())
     }
 
-    /// Changes settings while the run goes on, and writes them into the run directory.
+    /// Changes settings while the run goes on, and writes them into the run directory; all of it or nothing, whether or not
+    /// the caller stays.
     ///
     /// # Errors
-    /// When a setting is wrong or cannot change now, when it cannot be written down, or when the run is over.
+    /// When a setting is wrong or cannot change now, or when the run is over.
     pub async fn set(&self, request: v1::SetRequest) -> Result<v1::RunStatus, AskError> {
+        let run = self.clone();
+        to_its_end(async move { run.set_now(request).await }).await
+    }
+
+    async fn set_now(&self, request: v1::SetRequest) -> Result<v1::RunStatus, AskError> {
         let v1::SetRequest { settings, log } = request;
         let _one_at_a_time = self.setting.lock().await;
         let tables: Vec<_> =
@@ -162,10 +166,17 @@ impl RunHandle {
         if !log.is_empty() {
             (self.set_log)(&log).map_err(AskError::Log)?;
         }
-        self.run_dir.write_config(&config)?;
         let status = self.ask(|answer| Control::Set(Arc::clone(&config), answer)).await?;
-        self.config.send_replace(config);
+        self.config.send_replace(Arc::clone(&config));
         tracing::info!(?settings, log, "settings changed");
+        // A full disk may be why settings change: `checkpoints.rescue_dir` is of use then.
+        if let Err(error) = self.run_dir.write_config(&config) {
+            let what = format!(
+                "settings were changed and could not be written down: {error}; set them again later, or a resumed run \
+                 will not have them"
+            );
+            self.warn(what).await;
+        }
         Ok(status)
     }
 
@@ -174,16 +185,32 @@ impl RunHandle {
     /// # Errors
     /// When the run is over.
     pub async fn pause(&self) -> Result<v1::RunStatus, AskError> {
+        let run = self.clone();
+        to_its_end(async move { run.pause_now().await }).await
+    }
+
+    async fn pause_now(&self) -> Result<v1::RunStatus, AskError> {
         let _one_at_a_time = self.setting.lock().await;
         let status = self.ask(Control::Pause).await?;
-        // A run that is stopping is not paused. A full disk may be why somebody pauses: it does not keep them from it.
+        // A run that is stopping is not paused. A full disk may be why a run is paused: it is paused all the same.
         if status.state() == v1::RunState::Paused
             && let Err(error) = write_whole(&self.run_dir.paused(), b"")
         {
             let path = self.run_dir.paused();
-            tracing::warn!(path = %path.display(), %error, "if the learner is killed, the next one will not be paused");
+            let what = format!(
+                "{}: {error}; if the learner is killed now, the next one will not be paused",
+                path.display()
+            );
+            self.warn(what).await;
         }
         Ok(status)
+    }
+
+    /// Warns the person who runs it.
+    async fn warn(&self, what: String) {
+        tracing::warn!("{what}");
+        // When the run is over, the log has it.
+        let _ = self.events.send(Input::News(News::Warning(what)).into()).await;
     }
 
     /// Resumes a run that is paused.
@@ -191,9 +218,14 @@ impl RunHandle {
     /// # Errors
     /// When the run is over.
     pub async fn resume(&self) -> Result<v1::RunStatus, AskError> {
-        let _one_at_a_time = self.setting.lock().await;
-        let _ = fs::remove_file(self.run_dir.paused());
-        self.ask(Control::Resume).await
+        let run = self.clone();
+        to_its_end(async move {
+            let _one_at_a_time = run.setting.lock().await;
+            // Most often it is there; without it the next learner would not be paused either.
+            let _ = fs::remove_file(run.run_dir.paused());
+            run.ask(Control::Resume).await
+        })
+        .await
     }
 
     /// Asks the coordinator.
@@ -287,5 +319,90 @@ impl RunHandle {
             work(&mut Acting::new(&model, &snapshot.to_params()), &snapshot, &given_up)
         });
         Ok(rolled.await?)
+    }
+}
+
+/// Does something to its end though its caller hangs up, which drops this future: what belongs together is done together.
+async fn to_its_end<T: Send + 'static>(
+    work: impl Future<Output = Result<T, AskError>> + Send + 'static,
+) -> Result<T, AskError> {
+    tokio::spawn(work.in_current_span()).await?
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rit_config::OwnedRunDir;
+
+    struct Run {
+        _folder: tempfile::TempDir,
+        run_dir: RunDir,
+        handle: RunHandle,
+        /// What reaches the coordinator.
+        events: mpsc::Receiver<Event>,
+    }
+
+    fn run() -> Run {
+        let config = rit_config::resolve("environment.task_set = 'matrix-game'", "test", &[]).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let run_dir = OwnedRunDir::create(&folder.path().join("run"), &config).unwrap().run_dir().clone();
+        let model = Arc::new(Model::new(config.model()).unwrap());
+        let board = Arc::new(WeightsBoard::new(Snapshot::new(0, 0, &[]), 0));
+        let (to_coordinator, events) = mpsc::channel(8);
+        let set_log: SetLog = Arc::new(|_: &str| Ok(()));
+        let handle = RunHandle::new(to_coordinator, board, config, run_dir.clone(), model, &[], set_log);
+        Run { _folder: folder, run_dir, handle, events }
+    }
+
+    fn request(key: &str, value: &str) -> v1::SetRequest {
+        v1::SetRequest { settings: [(key.to_owned(), value.to_owned())].into(), log: String::new() }
+    }
+
+    /// The settings that the coordinator is told, and the way to answer.
+    async fn told(events: &mut mpsc::Receiver<Event>) -> (Arc<Config>, oneshot::Sender<v1::RunStatus>) {
+        match events.recv().await {
+            Some(Event::Control(Control::Set(config, answer))) => (config, answer),
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[tokio::test]
+    async fn a_caller_that_hangs_up_takes_no_setting_back() {
+        let Run { _folder, handle, mut events, .. } = run();
+        let caller = handle.clone();
+        let first = tokio::spawn(async move { caller.set(request("checkpoints.last_retry_ms", "5")).await });
+        let (_, answer) = told(&mut events).await;
+        first.abort();
+        assert!(first.await.unwrap_err().is_cancelled());
+        answer.send(v1::RunStatus::default()).unwrap();
+        let second =
+            tokio::spawn(async move { handle.set(request("checkpoints.every_env_steps", "500")).await });
+        let (config, answer) = told(&mut events).await;
+        let checkpoints = &config.checkpoints;
+        assert_eq!((checkpoints.last_retry_ms, checkpoints.every_env_steps), (5, 500));
+        answer.send(v1::RunStatus::default()).unwrap();
+        second.await.unwrap().unwrap();
+    }
+
+    #[tokio::test]
+    async fn settings_change_though_they_cannot_be_written_down() {
+        let Run { _folder, run_dir, handle, mut events } = run();
+        // A file is not prepared where a folder lies.
+        fs::create_dir(run_dir.root().join("config.partial")).unwrap();
+        let before = fs::read(run_dir.root().join("config.toml")).unwrap();
+        // Without an answer the handle is dropped, which closes the channel.
+        let set = tokio::spawn(async move {
+            let changed = handle.set(request("checkpoints.rescue_dir", "/elsewhere")).await;
+            changed.map(|_| handle)
+        });
+        let (config, answer) = told(&mut events).await;
+        assert_eq!(config.checkpoints.rescue_dir, "/elsewhere");
+        answer.send(v1::RunStatus::default()).unwrap();
+        let handle = set.await.unwrap().unwrap();
+        assert_eq!(handle.config().checkpoints.rescue_dir, "/elsewhere");
+        let warned = events.recv().await;
+        let Some(Event::Input(Input::News(News::Warning(what)))) = warned else { panic!("{warned:?}") };
+        assert!(what.contains("config.toml") && what.contains("set them again later"), "{what}");
+        assert_eq!(fs::read(run_dir.root().join("config.toml")).unwrap(), before);
     }
 }

@@ -51,7 +51,7 @@ pub struct EventFile {
 impl EventFile {
     /// Begins a file in this folder, after what lay there at `position`. Files and records after that were
     /// written by a learner that died, and will be written again: the first line to come has `from_env_steps` or
-    /// more. Returns what somebody should know of too: files that had to be cut.
+    /// more. Also returns warnings: files that had to be cut.
     ///
     /// # Errors
     /// When the folder or a file cannot be written.
@@ -140,7 +140,8 @@ fn cut(path: &Path, end: Option<u64>) -> io::Result<Option<String>> {
     let warning = || {
         let path = path.display();
         format!(
-            "{path} ends in part of a record or too early: it is cut after its last whole one; metrics.jsonl has the same numbers"
+            "{path} ends in part of a record or too early: it is cut after its last whole one; metrics.jsonl has the \
+             same numbers"
         )
     };
     Ok(((whole as u64) < wanted).then(warning))
@@ -427,7 +428,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_torn_is_cut_behind_the_last_whole_record_and_said() {
+    fn what_is_torn_is_cut_after_the_last_whole_record_and_said() {
         let run = Run::new();
         let (mut first, _) = run.create(&Position::default(), 0);
         let path = run.folder().join(&first.position().file);

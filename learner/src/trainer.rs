@@ -22,7 +22,7 @@ use crate::{
     writer::Written,
 };
 use rit_algo::{
-    Learner, Regime,
+    Learner, Model, Regime,
     learner::{Draw, Measure, NamedState, StateError},
 };
 use rit_config::{Config, RunDir, Until};
@@ -43,6 +43,7 @@ use tokio::sync::oneshot;
 pub struct Trainer {
     config: Config,
     run_dir: RunDir,
+    model: Arc<Model>,
     learner: Box<dyn Learner>,
     /// None where each batch is learned from once.
     replay: Option<Replay>,
@@ -60,7 +61,7 @@ pub struct Trainer {
     env_steps_before: u64,
     news: Box<dyn FnMut(News) + Send>,
     writer: WriteQueue,
-    /// What somebody should know of how this learner began and ended.
+    /// Warnings of how this learner began and ended.
     warnings: Vec<String>,
     /// What checkpoints say of where they come from.
     origin: Origin,
@@ -71,6 +72,14 @@ pub struct Trainer {
     evaluated: Option<(Progress, Vec<TaskResult>)>,
     /// The best policy so far with its parameters, where it is kept.
     best: Option<(Best, Vec<f32>)>,
+}
+
+/// A method's networks, and the learner that trains them.
+pub struct Algorithm {
+    /// The networks.
+    pub model: Arc<Model>,
+    /// The learner, with the weights that the run begins with.
+    pub learner: Box<dyn Learner>,
 }
 
 /// What a run is made with, for its record.
@@ -93,7 +102,7 @@ pub struct Beginning {
     pub standing: Standing,
     /// What its updates report.
     pub measures: &'static [Measure],
-    /// What somebody should know of it.
+    /// Warnings.
     pub warnings: Vec<String>,
 }
 
@@ -106,7 +115,7 @@ impl Trainer {
     pub fn new(
         config: Config,
         run_dir: RunDir,
-        learner: Box<dyn Learner>,
+        Algorithm { model, learner }: Algorithm,
         loaded: Option<Loaded>,
         news: Box<dyn FnMut(News) + Send>,
         writer: WriteQueue,
@@ -144,6 +153,7 @@ impl Trainer {
             made,
             evaluated: None,
             best: None,
+            model,
             learner,
             run_dir,
             config,
@@ -155,7 +165,7 @@ impl Trainer {
         Ok((trainer, board))
     }
 
-    /// Somebody who reads what is measured.
+    /// A reader of the metrics file.
     pub fn metrics_follower(&self) -> Follower {
         self.metrics.follower()
     }
@@ -274,9 +284,17 @@ impl Trainer {
         }
     }
 
-    /// One batch: into replay, where there is one, one update, and whatever is due.
+    /// One batch: into replay, where there is one, one update, and what is due to be measured.
     fn train(&mut self, episodes: Vec<Episode>) -> Result<(), TrainError> {
-        let algorithm = &self.config.algorithm;
+        let collected = self.collect(episodes);
+        self.update(&collected)?;
+        self.standing.replay_episodes = self.replay.as_ref().map_or(0, Replay::len);
+        self.standing.recent = self.recent.results();
+        self.measure_what_is_due()
+    }
+
+    /// Counts a batch, and adds it to replay, where there is one.
+    fn collect(&mut self, episodes: Vec<Episode>) -> Vec<Arc<Episode>> {
         let progress = &mut self.standing.progress;
         self.env_steps_before = progress.env_steps;
         let mut collected = Vec::with_capacity(episodes.len());
@@ -291,6 +309,13 @@ impl Trainer {
             }
             collected.push(episode);
         }
+        collected
+    }
+
+    /// Makes an update with the batch, or with one drawn from replay once that holds enough; publishes the weights.
+    fn update(&mut self, collected: &[Arc<Episode>]) -> Result<(), TrainError> {
+        let algorithm = &self.config.algorithm;
+        let progress = &mut self.standing.progress;
         let draw = Draw { seed: self.config.seed, update: progress.updates };
         let batch = match &self.replay {
             Some(replay) if replay.len() < algorithm.batch_size => None,
@@ -313,16 +338,17 @@ impl Trainer {
             let acting = acting_params(&*self.learner);
             self.board.publish(Snapshot::new(progress.updates, progress.env_steps, acting));
         }
-        let after = *progress;
-        self.standing.replay_episodes = self.replay.as_ref().map_or(0, Replay::len);
-        self.standing.recent = self.recent.results();
+        Ok(())
+    }
+
+    fn measure_what_is_due(&mut self) -> Result<(), TrainError> {
         if self.is_due(self.config.learner.metrics_every_env_steps) {
             let standing = &self.standing;
             let tasks = standing.recent.iter().map(|result| (result.task.clone(), result.clone()));
             let point = TrainingPoint {
-                progress: after,
+                progress: standing.progress,
                 wall_s: self.metrics.wall_s(),
-                epsilon: self.config.epsilon(after.env_steps).into(),
+                epsilon: self.config.epsilon(standing.progress.env_steps).into(),
                 measured: standing.measured.clone(),
                 tasks: tasks.collect(),
             };
@@ -417,7 +443,7 @@ impl Trainer {
 
 /// The weights that actors need.
 fn acting_params(learner: &dyn Learner) -> &[f32] {
-    &learner.params()[learner.model().acting()]
+    &learner.params()[learner.acting()]
 }
 
 /// The files that show how training goes: begun, or continued from a checkpoint. What was repaired is said.

@@ -38,7 +38,7 @@ impl Snapshot {
     }
 }
 
-/// Where the trainer puts snapshots and everybody else finds them.
+/// Where the trainer puts snapshots and all others find them.
 #[derive(Debug)]
 pub struct WeightsBoard {
     kept: Mutex<Kept>,

@@ -106,6 +106,13 @@ impl WriteQueue {
     }
 }
 
+impl WriteQueue {
+    /// Whether the writer has gone: it takes nothing any more.
+    pub fn is_closed(&self) -> bool {
+        self.0.lock().closed
+    }
+}
+
 impl Drop for WriteQueue {
     fn drop(&mut self) {
         self.0.close();
@@ -207,12 +214,13 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn whoever_waits_is_told_that_the_writer_has_gone() {
+    async fn those_that_wait_are_told_that_the_writer_has_gone() {
         let (queue, reader) = write_queue(1);
         let (answer, answered) = oneshot::channel();
         queue.checkpoint(state(1), Some(answer));
+        assert!(!queue.is_closed());
         drop(reader);
-        assert!(answered.await.is_err());
+        assert!(answered.await.is_err() && queue.is_closed());
         let (answer, answered) = oneshot::channel();
         queue.checkpoint(state(2), Some(answer));
         assert!(answered.await.is_err());

@@ -6,7 +6,7 @@
 
 use crate::{
     checkpoint::{self, CheckpointError, TrainingState},
-    coordinator::Event,
+    coordinator::{Event, Input},
     replay_log::ReplayLog,
     write_queue::{StateToWrite, ToWrite, WriteQueueReader},
 };
@@ -51,7 +51,7 @@ pub struct Writer {
     pub replay_episodes: usize,
     /// Checkpoints kept.
     pub keep: usize,
-    /// Who is told of checkpoints.
+    /// Leads to the coordinator, which is told of checkpoints.
     pub events: async_mpsc::Sender<Event>,
 }
 
@@ -81,7 +81,7 @@ impl Writer {
                     let failed = written.as_ref().err().cloned();
                     let ended = CheckpointEnded { env_steps, duration, failed };
                     // At the end of a run the coordinator may have gone.
-                    let _ = self.events.blocking_send(Event::CheckpointEnded(ended));
+                    let _ = self.events.blocking_send(Input::CheckpointEnded(ended).into());
                     for answer in answers {
                         // The caller may have gone.
                         let _ = answer.send(written.clone());
@@ -110,7 +110,15 @@ impl Writer {
         self.append(waiting)?;
         self.log.sync()?;
         let path = checkpoint::save(&self.run_dir, &self.model, &self.names, state, self.keep)?;
-        self.log.forget_before(checkpoint::replay_needed_from(&self.run_dir, self.replay_episodes)?)?;
+        // The checkpoint is on disk: replay that cannot be removed does not make it a failure.
+        if let Err(error) = self.forget_replay() {
+            tracing::warn!(%error, "old replay stays until the next checkpoint");
+        }
         Ok(path)
+    }
+
+    /// Removes the replay that none of the checkpoints needs.
+    fn forget_replay(&self) -> Result<(), CheckpointError> {
+        Ok(self.log.forget_before(checkpoint::replay_needed_from(&self.run_dir, self.replay_episodes)?)?)
     }
 }

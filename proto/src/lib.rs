@@ -3,6 +3,9 @@
 pub mod snapshot;
 pub mod transport;
 
+/// The detail of a [`v1::Loss`] is shown to people: its longest, in characters. The actor cuts it, and the learner again.
+pub const LOSS_DETAIL_CHARS_MAX: usize = 500;
+
 /// Generated from `rit/v1/*.proto`, where every message is documented.
 #[allow(missing_docs, unused_qualifications, clippy::all, reason = "generated code")]
 pub mod v1 {

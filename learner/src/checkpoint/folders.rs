@@ -5,6 +5,7 @@
 //! successor lies there.
 
 use super::{CheckpointError, FILE_BYTES_MAX, MANIFEST, Manifest, io};
+use crate::damaged;
 use std::{
     fs,
     io::ErrorKind,
@@ -13,8 +14,6 @@ use std::{
 
 /// What a folder is called while it is written.
 pub(super) const PARTIAL: &str = "partial";
-/// What a damaged one is called once it was passed over.
-const DAMAGED: &str = "damaged";
 
 /// A folder called like a checkpoint.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -34,7 +33,7 @@ impl Folder {
             None => (name, "1"),
         })?;
         let (env_steps, repetition) = (steps.parse().ok()?, repetition.parse().ok()?);
-        // Only names that this build gives: `step-5` and `step-+00000000005` are somebody else's.
+        // Only names that this build gives: `step-5` and `step-+00000000005` are not ours.
         (self::name(env_steps, repetition) == name).then_some(Self { env_steps, repetition, path })
     }
 
@@ -118,12 +117,10 @@ pub(super) fn named(all: &Path, name: &str) -> Option<Folder> {
     Folder::parse(all.join(name))
 }
 
-/// Renames a damaged checkpoint, so that it does not count any more, and returns its new place; `None` where that does
-/// not go.
+/// Renames a damaged checkpoint, so that it does not count any more, and returns its new place; `None` if it cannot be
+/// renamed.
 pub(super) fn set_aside(folder: &Path) -> Option<PathBuf> {
-    let places = std::iter::once(String::new()).chain((2..100).map(|number| format!("-{number}")));
-    let places = places.map(|number| folder.with_extension(format!("{DAMAGED}{number}")));
-    let free = places.into_iter().find(|place| fs::symlink_metadata(place).is_err())?;
+    let free = damaged::free_place(folder)?;
     fs::rename(folder, &free).ok()?;
     Some(free)
 }

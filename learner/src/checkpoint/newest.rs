@@ -20,7 +20,7 @@ pub struct Loaded {
     pub state: TrainingState,
     /// Replay, oldest first.
     pub replay: Vec<Episode>,
-    /// What somebody should know of: newer ones that could not be used, settings that have changed.
+    /// Warnings: newer checkpoints that could not be used, settings that have changed.
     pub warnings: Vec<String>,
 }
 

@@ -1,5 +1,12 @@
 use super::*;
-use crate::{ledger::Terms, tensorboard::Position};
+use crate::{
+    coordinator::{Event, Input},
+    ledger::Terms,
+    replay_log::ReplayLog,
+    tensorboard::Position,
+    write_queue::write_queue,
+    writer::Writer,
+};
 use rit_config::{Config, OwnedRunDir};
 use rit_episode::{
     RunSeed, Stream,
@@ -17,6 +24,7 @@ use std::{
 struct Run {
     _folder: tempfile::TempDir,
     run_dir: RunDir,
+    model: Model,
     learner: Box<dyn Learner>,
     config: Config,
 }
@@ -26,21 +34,21 @@ fn run() -> Run {
     config.algorithm.buffer_size = 0;
     let folder = tempfile::tempdir().unwrap();
     let run_dir = OwnedRunDir::create(&folder.path().join("run"), &config).unwrap().run_dir().clone();
-    let model = Arc::new(Model::new(config.model()).unwrap());
+    let model = Model::new(config.model()).unwrap();
     let params = model.initial(&mut RunSeed(1).stream(Stream::Weights, 0));
-    let learner = rit_algo::learner(model, config.update(), params).unwrap();
-    Run { _folder: folder, run_dir, learner, config }
+    let learner = model.learner(config.update(), params).unwrap();
+    Run { _folder: folder, run_dir, model, learner, config }
 }
 
 impl Run {
     /// A state whose numbers tell which it is. Its run has a replay of no episodes.
     fn state(&self, env_steps: u64) -> TrainingState {
         let numbers = |len: usize, index: u64| -> Vec<f32> {
-            let layout = self.learner.model().initial(&mut RunSeed(env_steps).stream(Stream::Weights, index));
+            let layout = self.model.initial(&mut RunSeed(env_steps).stream(Stream::Weights, index));
             layout.into_iter().cycle().take(len).collect()
         };
         let params = numbers(self.learner.params().len(), 0);
-        let acting = numbers(self.learner.model().acting().len(), 1);
+        let acting = numbers(self.learner.acting().len(), 1);
         let learner =
             self.learner.state().into_iter().enumerate().map(|(index, NamedState { name, numbers: its })| {
                 let numbers = match its {
@@ -89,13 +97,8 @@ impl Run {
     }
 
     fn save_and_keep(&self, env_steps: u64, keep: usize) -> PathBuf {
-        let saved = save(
-            &self.run_dir,
-            self.learner.model(),
-            &TaskNames::of(&self.config),
-            &self.state(env_steps),
-            keep,
-        );
+        let saved =
+            save(&self.run_dir, &self.model, &TaskNames::of(&self.config), &self.state(env_steps), keep);
         self.run_dir.root().join(saved.unwrap())
     }
 
@@ -282,7 +285,7 @@ fn fewer_steps_than_are_done_are_refused_and_as_many_are_not() {
 }
 
 #[test]
-fn a_renamed_copy_is_not_the_newest_and_evicts_nobody() {
+fn a_renamed_copy_is_not_the_newest_and_evicts_no_other() {
     let run = run();
     let real = run.save(10);
     let copy = run.run_dir.checkpoints().join("step-999999999999");
@@ -391,7 +394,7 @@ fn wherever_writing_was_cut_short_the_next_learner_goes_on() {
 }
 
 #[test]
-fn whoever_wants_the_weights_alone_is_told_whose_they_are() {
+fn readers_of_the_weights_alone_are_told_whose_they_are() {
     let (run, other) = (run(), run());
     let of = |run: &Run, which| weights(&run.run_dir, &run.config, which);
     let latest = |run: &Run| of(run, Which::Latest);
@@ -399,7 +402,7 @@ fn whoever_wants_the_weights_alone_is_told_whose_they_are() {
     let folder = run.save(20);
     assert_eq!(fs::canonicalize(latest(&run).unwrap().unwrap()).unwrap(), folder.join(WEIGHTS));
     let best = of(&run, Which::Best).unwrap().unwrap();
-    let best = weights_file::load(&best, run.learner.model().layout()).unwrap();
+    let best = weights_file::load(&best, run.learner.layout()).unwrap();
     assert_eq!(Some(best), run.state(20).best);
     assert_eq!(of(&run, Which::Step(20)).unwrap(), Some(folder.join(WEIGHTS)));
     let elsewhere = of(&run, Which::Step(30)).unwrap_err().to_string();
@@ -420,11 +423,43 @@ fn whoever_wants_the_weights_alone_is_told_whose_they_are() {
 }
 
 #[test]
+fn a_checkpoint_is_written_though_old_replay_cannot_be_removed() {
+    let run = run();
+    let mut state = run.state(2000);
+    state.manifest.progress.episodes = 2000;
+    let (replay, layout) = (run.run_dir.replay(), PayloadLayout::new(run.config.dims()));
+    let log = ReplayLog::open(&replay, layout, run.run_dir.lineage(), 2000).unwrap();
+    // It is called like a file of replay, and is removed in another way.
+    fs::create_dir(replay.join("000000000000.frames")).unwrap();
+    let (events, mut told) = tokio::sync::mpsc::channel(1);
+    let writer = Writer {
+        run_dir: run.run_dir.clone(),
+        model: Arc::new(Model::new(run.config.model()).unwrap()),
+        names: TaskNames::of(&run.config),
+        log,
+        replay_episodes: 0,
+        keep: 3,
+        events,
+    };
+    let (queue, reader) = write_queue(0);
+    let (answer, answered) = tokio::sync::oneshot::channel();
+    queue.checkpoint(Box::new(state), Some(answer));
+    drop(queue);
+    writer.run(&reader);
+    assert_eq!(answered.blocking_recv().unwrap(), Ok("checkpoints/step-000000002000".into()));
+    let ended = told.blocking_recv();
+    let Some(Event::Input(Input::CheckpointEnded(ended))) = ended else { panic!("{ended:?}") };
+    assert_eq!((ended.env_steps, ended.failed), (2000, None));
+    assert!(replay.join("000000000000.frames").exists(), "it could not be removed");
+    assert_eq!(run.names(), ["step-000000002000"]);
+}
+
+#[test]
 fn a_checkpoint_without_a_best_policy_says_so() {
     let run = run();
     let mut state = run.state(20);
     (state.best, state.manifest.best) = (None, None);
-    save(&run.run_dir, run.learner.model(), &TaskNames::of(&run.config), &state, 3).unwrap();
+    save(&run.run_dir, &run.model, &TaskNames::of(&run.config), &state, 3).unwrap();
     assert_eq!(run.load().unwrap().unwrap().state, state);
     let none = weights(&run.run_dir, &run.config, Which::Best).unwrap_err().to_string();
     assert!(none.contains("keeps no best policy: checkpoints.keep_best was not set"), "{none}");

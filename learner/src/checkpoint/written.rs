@@ -1,7 +1,7 @@
 //! `checkpoints.json`: that the run has written checkpoints, and which was the newest. It lies beside their folder, so
 //! that a run whose checkpoints are gone is no new run.
 
-use super::{CheckpointError, LATEST, io, write_whole};
+use super::{CheckpointError, LATEST, io, write_durably};
 use crate::checkpoint::origin::Origin;
 use rit_config::{RunDir, TEXT_BYTES_MAX, read_regular};
 use rit_record::{Ended, Summary};
@@ -27,7 +27,7 @@ pub(super) fn remember(run_dir: &RunDir, origin: &Origin, newest: &str) -> Resul
         Written { format_version: *format_version, run_id: run_id.clone(), newest: newest.to_owned() };
     let path = path(run_dir);
     let text = serde_json::to_vec_pretty(&written).map_err(|error| io(&path)(error.into()))?;
-    write_whole(&path, &text)
+    write_durably(&path, &text)
 }
 
 /// The newest checkpoint that this run is known to have written, by its folder's name or by what tells of it; `None`

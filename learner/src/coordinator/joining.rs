@@ -1,6 +1,6 @@
-//! Who may join, and whose place he takes.
+//! Decides whether an actor may join, and which earlier actor it replaces.
 
-use super::{Actor, Coordinator, Effect, Joining, Refusal, messages::NAME_CHARS_MAX};
+use super::{Actor, Coordinator, Effect, Joining, Refusal};
 use crate::{gauges::Stopwatch, ledger::ActorId};
 use rit_episode::wire;
 
@@ -19,9 +19,6 @@ impl Coordinator {
         let Joining { name, pid, layout_version, instance, remote, slot } = joining;
         if self.over_since.is_some() {
             return Err(Refusal::Over);
-        }
-        if name.is_empty() || name.chars().count() > NAME_CHARS_MAX || name.contains(char::is_control) {
-            return Err(Refusal::Name);
         }
         if layout_version != wire::LAYOUT_VERSION {
             return Err(Refusal::Layout { name, theirs: layout_version, ours: wire::LAYOUT_VERSION });

@@ -60,7 +60,7 @@ pub enum Input {
 /// Who wants to join.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Joining {
-    /// Its name, for people.
+    /// Its name, for people: one that [`RolloutService`](crate::rollout_service::RolloutService) lets in.
     pub name: String,
     /// Its process.
     pub pid: u32,
@@ -113,11 +113,6 @@ pub enum Effect {
 /// Why an actor may not join.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Refusal {
-    /// Its name is nothing to show to people.
-    #[error(
-        "an actor's name has 1 to {NAME_CHARS_MAX} characters, none of them a control character; choose another --name"
-    )]
-    Name,
     /// Another build.
     #[error("actor {name} writes frame layout {theirs}, this learner reads {ours}; use the same build")]
     Layout {
@@ -138,7 +133,7 @@ pub enum Refusal {
         /// How many may be there.
         max: usize,
     },
-    /// The name is somebody else's.
+    /// Another actor has the name.
     #[error("an actor named {name} is there already (process {pid}); choose another --name")]
     Taken {
         /// The name.
@@ -150,6 +145,3 @@ pub enum Refusal {
     #[error("the run is over")]
     Over,
 }
-
-/// Longest name of an actor.
-pub const NAME_CHARS_MAX: usize = 64;

@@ -1,14 +1,12 @@
 //! Around the coordinator: the clock, the channels, and the ways to answer.
 
-use super::{Coordinator, Effect, Input, Joining, LOOK_EVERY, Loss, Refusal};
+use super::{Coordinator, Effect, Input, Joining, LOOK_EVERY, Refusal};
 use crate::{
     ledger::{ActorId, Terms},
     receive::Fence,
-    trainer::{Checkpointed, News, Work},
-    writer::CheckpointEnded,
+    trainer::{Checkpointed, Work},
 };
 use rit_config::Config;
-use rit_episode::Episode;
 use rit_proto::v1::{self, LearnerMessage, learner_message::Message};
 use rit_record::Ended;
 use std::{
@@ -30,33 +28,18 @@ pub type ToActor = async_mpsc::Sender<Result<LearnerMessage, Status>>;
 /// What happens to a run, with the ways to answer.
 #[derive(Debug)]
 pub enum Event {
-    /// An episode was read and found valid.
-    Episode(ActorId, Box<Episode>),
-    /// A frame was refused.
-    FrameRefused(&'static str),
+    /// What needs no answer: all but [`Input::Join`].
+    Input(Input),
     /// An actor wants to join.
     Join(v1::Hello, ToActor, oneshot::Sender<Result<ActorId, Status>>),
-    /// An actor has sent all of this lease, but for what was lost.
-    Done(ActorId, u64, Vec<Loss>),
-    /// All that an actor had sent by `Done` has been read.
-    Fenced(Fence),
-    /// An actor is there.
-    Heartbeat(ActorId),
-    /// An actor wants to go.
-    Leaving(ActorId),
-    /// An actor's stream has ended.
-    Gone(ActorId),
-    /// Shared memory is elsewhere from now on, with what a person should know of the new place: actors that send there have
-    /// to join again.
-    PlaceLost(Option<String>),
-    /// The trainer speaks.
-    News(News),
-    /// The writer is done with a checkpoint.
-    CheckpointEnded(CheckpointEnded),
-    /// The trainer or the receiving thread is done, well or not: nothing more can happen.
-    Over,
-    /// Somebody asks or wants something.
+    /// A caller asks or wants something.
     Control(Control),
+}
+
+impl From<Input> for Event {
+    fn from(input: Input) -> Self {
+        Self::Input(input)
+    }
 }
 
 /// What callers want, each with the way to answer.
@@ -128,25 +111,15 @@ impl Shell {
     }
 
     fn take(&mut self, event: Event) {
-        self.tell(match event {
-            Event::Episode(actor, episode) => Input::Episode(actor, episode),
-            Event::FrameRefused(reason) => Input::FrameRefused(reason),
-            Event::Done(actor, lease, losses) => Input::Done(actor, lease, losses),
-            Event::Fenced(fence) => Input::Fenced(fence),
-            Event::Heartbeat(actor) => Input::Heartbeat(actor),
-            Event::Leaving(actor) => Input::Leaving(actor),
-            Event::Gone(actor) => Input::Gone(actor),
-            Event::PlaceLost(notice) => Input::PlaceLost(notice),
-            Event::News(news) => Input::News(news),
-            Event::CheckpointEnded(ended) => Input::CheckpointEnded(ended),
-            Event::Over => Input::Over,
+        match event {
+            Event::Input(input) => self.tell(input),
             Event::Join(hello, to, answer) => {
                 let v1::Hello { name, pid, layout_version, instance, remote, slot } = hello;
                 let joining = Joining { name, pid, layout_version, instance, remote, slot };
-                return self.tell_with(Input::Join(joining), Some((to, answer)));
+                self.tell_with(Input::Join(joining), Some((to, answer)));
             }
-            Event::Control(control) => return self.control(control),
-        });
+            Event::Control(control) => self.control(control),
+        }
     }
 
     /// The caller may have gone; the answer is then dropped.
@@ -243,7 +216,6 @@ impl Shell {
 fn refused(refusal: &Refusal) -> Status {
     let message = refusal.to_string();
     match refusal {
-        Refusal::Name => Status::invalid_argument(message),
         Refusal::Layout { .. } | Refusal::Remote { .. } => Status::failed_precondition(message),
         Refusal::Taken { .. } => Status::already_exists(message),
         Refusal::Over => Status::unavailable(message),

@@ -7,7 +7,7 @@ use std::time::Duration;
 const REJOINS: u32 = 3;
 
 impl Coordinator {
-    /// Something went on: an episode came, a batch is done, or somebody let the run go on.
+    /// Notes that the run goes on: an episode came, or a batch is done.
     pub(super) fn moved(&mut self) {
         self.moved_at = self.now;
         self.joins = 0;

@@ -19,6 +19,10 @@ use tokio::sync::oneshot;
 /// From one attempt at a run's last files to the next.
 const RETRY_EVERY: Duration = Duration::from_secs(1);
 
+/// Why a checkpoint has no answer.
+const WRITER_GONE: &str =
+    "the write thread panicked; this is a fault of the program, its message is in the log";
+
 impl Trainer {
     /// The last checkpoint, the last evaluation and the summary.
     pub(super) fn finish(
@@ -37,7 +41,7 @@ impl Trainer {
                 trainer.checkpoint(Some(done));
                 written
             });
-            let written = written.blocking_recv().map_err(|_| "the writer has gone".to_owned())?;
+            let written = written.blocking_recv().map_err(|_| WRITER_GONE.to_owned())?;
             written.map(drop)
         });
         if let Err(error) = checkpointed {
@@ -98,7 +102,7 @@ impl Trainer {
         if !evaluation.absolute_metric {
             return Ok(Some(best));
         }
-        let (acting, seed) = (self.learner.model().acting(), self.config.seed.derive("absolute metric", 0));
+        let (acting, seed) = (self.learner.acting(), self.config.seed.derive("absolute metric", 0));
         let mut of_split = |split: Split, episodes: usize| {
             let results = self.roll(&params[acting.clone()], split, Some(10 * episodes), seed)?;
             if !results.is_empty() {
@@ -113,8 +117,8 @@ impl Trainer {
         Ok(Some(Best { evaluation: training, testing, ..best }))
     }
 
-    /// Tries until it is done, for as long as `checkpoints.last_retry_ms` says: a disk that is full now may not be later.
-    /// Says so once. A second wish to stop is one not to wait.
+    /// Repeats an attempt until it succeeds or `checkpoints.last_retry_ms` is over: a full disk may have room later.
+    /// Reports the failure once. A second request to stop ends the waiting.
     fn insist(
         &mut self,
         what: &str,
@@ -133,8 +137,9 @@ impl Trainer {
                 Err(error) => error,
             };
             let limit = Duration::from_millis(self.config.checkpoints.last_retry_ms);
-            // A directory that was removed does not come back, as room on a disk does.
-            if begun.elapsed() >= limit || !self.run_dir.root().is_dir() {
+            // A directory that was removed does not come back, as room on a disk does; nor does a writer.
+            let may_pass = self.run_dir.root().is_dir() && !self.writer.is_closed();
+            if begun.elapsed() >= limit || !may_pass {
                 return Err(error);
             }
             if !std::mem::replace(&mut refused, true) {
@@ -168,8 +173,7 @@ impl Trainer {
         let run = self.run_dir.root().file_name().unwrap_or_default().to_string_lossy().into_owned();
         let name = format!("{run}-step-{:012}.safetensors", self.standing.progress.env_steps);
         let path = Path::new(folder).join(name);
-        let weights =
-            weights_file::encode(self.learner.model(), &TaskNames::of(&self.config), self.learner.params());
+        let weights = weights_file::encode(&self.model, &TaskNames::of(&self.config), self.learner.params());
         let written = weights.map_err(|error| error.to_string()).and_then(|bytes| {
             fs::create_dir_all(folder)
                 .and_then(|()| write_whole(&path, &bytes))

@@ -70,7 +70,7 @@ impl Trainer {
         episodes: Option<usize>,
         seed: RunSeed,
     ) -> Result<Vec<TaskResult>, LostEpisode> {
-        let new = |_| Acting::new(self.learner.model(), acting_params);
+        let new = |_| Acting::new(&self.model, acting_params);
         let mut policies: Vec<_> = (0..self.config.learner.threads).map(new).collect();
         let mut policies: Vec<_> = policies.iter_mut().map(|policy| policy as &mut dyn Policy).collect();
         self.evaluator.evaluate(&mut policies, &self.config.tasks(split), episodes, seed)

@@ -55,7 +55,7 @@ pub enum News {
     Trained(Terms, Standing),
     /// The run is over and will take no further batch; its last files are being written.
     Ending,
-    /// Something that somebody should know of.
+    /// A warning for the person who runs it.
     Warning(String),
 }
 
@@ -96,7 +96,8 @@ pub enum TrainError {
     /// An update that would make weights that are no numbers.
     #[error(
         "{error} in update {update}: training has diverged, and would again from its checkpoints, whose weights are \
-         whole; start a new run with a smaller algorithm.lr or algorithm.grad_norm_clip, such as --set algorithm.lr={lr:.0e}"
+         whole; start a new run with a smaller algorithm.lr or algorithm.grad_norm_clip, such as \
+         --set algorithm.lr={lr:.0e}"
     )]
     NotFinite {
         /// Its number, from 1.

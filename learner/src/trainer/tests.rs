@@ -21,6 +21,38 @@ fn batches(config: &Config, count: u64) -> Vec<Work> {
     (0..count).map(|index| batch(index * size)).collect()
 }
 
+/// A trainer of a new run.
+fn trainer(config: &Config, run_dir: &RunDir, writer: WriteQueue) -> Trainer {
+    let model = Arc::new(Model::new(config.model()).unwrap());
+    let params = model.initial(&mut config.seed.stream(Stream::Weights, 0));
+    let learner = model.learner(config.update(), params).unwrap();
+    let algorithm = Algorithm { model, learner };
+    let news = Box::new(|_| ());
+    let made = Made::default();
+    Trainer::new(config.clone(), run_dir.clone(), algorithm, None, news, writer, made).unwrap().0
+}
+
+/// The end of a run waits for room on the disk, for ten minutes if need be, and not for a thread that is no more.
+#[test]
+fn a_writer_that_has_gone_is_not_waited_for() {
+    let settings = ["network.hidden_dim=8", "evaluation.episodes=1"];
+    let settings = settings.map(|text| rit_config::set(text).unwrap());
+    let config = rit_config::resolve("environment.task_set = 'matrix-game'", "test", &settings).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let made = OwnedRunDir::create(&folder.path().join("run"), &config).unwrap();
+    let (writer, reader) = write_queue(1);
+    let trainer = trainer(&config, made.run_dir(), writer);
+    drop(reader);
+    let (work, queue) = mpsc::channel();
+    work.send(Work::Stop(Ended::Stopped)).unwrap();
+    let begun = std::time::Instant::now();
+    let ended = trainer.run(&queue);
+    let Err(TrainError::Checkpoint(why)) = ended else { panic!("{ended:?}") };
+    assert!(why.contains("the write thread panicked"), "{why}");
+    let limit_ms = u128::from(config.checkpoints.last_retry_ms);
+    assert!(begun.elapsed().as_millis() < limit_ms, "{limit_ms} ms are the longest it waits");
+}
+
 /// Weights so large that no sum of them is a number. What is not finite reaches neither the weights that actors get nor a
 /// checkpoint.
 #[test]
@@ -38,10 +70,11 @@ fn an_update_that_is_not_finite_ends_the_run_before_it_reaches_anything() {
         let model = Arc::new(Model::new(config.model()).unwrap());
         let mut params = model.initial(&mut config.seed.stream(Stream::Weights, 0));
         params.iter_mut().for_each(|weight| *weight = (*weight * 1e38).clamp(f32::MIN, f32::MAX));
-        let learner = rit_algo::learner(model, config.update(), params.clone()).unwrap();
+        let learner = model.learner(config.update(), params.clone()).unwrap();
+        let algorithm = Algorithm { model, learner };
         let (writer, written) = write_queue(config.replay_episodes().max(100));
         let (trainer, board) =
-            Trainer::new(config.clone(), run_dir, learner, None, Box::new(|_| ()), writer, Made::default())
+            Trainer::new(config.clone(), run_dir, algorithm, None, Box::new(|_| ()), writer, Made::default())
                 .unwrap();
         let (work, queue) = mpsc::channel();
         batches(&config, 3).into_iter().for_each(|batch| work.send(batch).unwrap());

@@ -47,7 +47,8 @@ pub fn router() -> Router<Page> {
 #[derive(Debug, thiserror::Error)]
 pub enum ApiError {
     #[error(
-        "the request does not carry the token: open the address with it that was printed (`rit ctl --run DIR web` prints a run's)"
+        "the request does not carry the token: open the address with it that was printed (`rit ctl --run DIR web` \
+         prints a run's)"
     )]
     Unauthorized,
     #[error("{0}")]
@@ -83,10 +84,9 @@ impl IntoResponse for ApiError {
                 | AskError::Setting(_)
                 | AskError::Log(_),
             ) => StatusCode::BAD_REQUEST,
-            Self::Ask(
-                AskError::Checkpoint(_) | AskError::Rollout(_) | AskError::RunDir(_) | AskError::Lost(_),
-            )
-            | Self::Io(_) => StatusCode::INTERNAL_SERVER_ERROR,
+            Self::Ask(AskError::Checkpoint(_) | AskError::Panicked(_) | AskError::Lost(_)) | Self::Io(_) => {
+                StatusCode::INTERNAL_SERVER_ERROR
+            }
         };
         (status, Json(serde_json::json!({ "error": self.to_string() }))).into_response()
     }
@@ -328,7 +328,7 @@ async fn log(
         processes.extend(name.strip_suffix(".log").map(str::to_owned));
     }
     processes.sort_by_key(|name| (name != "learner", name.len(), name.clone()));
-    // Only what lies there is read, whatever was asked for.
+    // Only what lies there is read: the name that was asked for may be a path.
     let text = match processes.contains(&process) {
         true => tail(&logs.join(format!("{process}.log")))?,
         false => return Err(ApiError::NotFound),

@@ -85,7 +85,7 @@ pub async fn enter(
     }
 }
 
-/// Refuses a name that somebody made point here.
+/// Refuses a `Host` that is no loopback name: DNS rebinding.
 pub async fn only_to_loopback(request: Request, next: Next) -> Response {
     if host(request.headers()).is_some_and(|host| is_loopback(&host)) {
         next.run(request).await
@@ -94,7 +94,7 @@ pub async fn only_to_loopback(request: Request, next: Next) -> Response {
     }
 }
 
-/// Refuses callers that do not know the token; and whatever changes something, unless the page itself asks for it.
+/// Refuses callers that do not know the token; and requests that change something, unless the page itself sends them.
 pub async fn only_with_token(State(gate): State<Arc<Gate>>, request: Request, next: Next) -> Response {
     if !gate.lets_in(request.headers()) {
         return ApiError::Unauthorized.into_response();

@@ -75,7 +75,7 @@ impl Door {
         self.address
     }
 
-    /// Serves until it is over, and everybody who was let in has been told.
+    /// Serves until it is over, and all callers that were let in have been told.
     pub async fn serve(self, router: Router, over: impl Future<Output = ()>) {
         let mut connections = JoinSet::new();
         tokio::select! {

@@ -27,7 +27,7 @@ use std::{
 /// Why the page cannot be served.
 #[derive(Debug, thiserror::Error)]
 pub enum WebError {
-    /// Somebody listens there.
+    /// Another process listens there.
     #[error("web.listen = \"{0}\" is in use; write another port, or 127.0.0.1:0 for one that is free")]
     InUse(SocketAddr),
     /// The system refused.
@@ -94,7 +94,7 @@ impl Web {
         self.door.address()
     }
 
-    /// Serves until the run is over and everybody has been told.
+    /// Serves until the run is over and all pages have been told.
     pub async fn serve(self, handle: RunHandle, metrics: Follower, run_dir: RunDir) {
         let learner = milliseconds();
         let gate = Gate::of_run(&run_dir);

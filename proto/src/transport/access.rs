@@ -29,7 +29,7 @@ pub struct AccessFiles {
     pub client_ca: Option<PathBuf>,
 }
 
-/// Why a learner does not listen: it would let somebody in whom it should not.
+/// Why a learner does not listen: callers would be let in that should not be.
 #[derive(Debug, thiserror::Error)]
 pub enum AccessError {
     /// Nothing is demanded.
@@ -130,7 +130,7 @@ impl Access {
     }
 }
 
-/// Whether what was given is the secret. Looks at every byte, whatever the first ones are.
+/// Whether what was given is the secret. Looks at every byte, even where the first ones differ.
 pub fn is_secret(given: &[u8], secret: &[u8]) -> bool {
     given.iter().zip(secret).fold(given.len() ^ secret.len(), |all, (a, b)| all | usize::from(a ^ b)) == 0
 }

@@ -29,7 +29,7 @@ pub enum FileError {
         /// Its mode.
         mode: u32,
     },
-    /// It is somebody else's.
+    /// It belongs to another user.
     #[error("{0} belongs to another user; have one of your own")]
     OthersFile(PathBuf),
     /// Too short, or with characters that cannot be sent.

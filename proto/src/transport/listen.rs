@@ -47,7 +47,7 @@ const LINGER_BYTES: usize = 4 << 10;
 /// Why a learner cannot listen.
 #[derive(Debug, thiserror::Error)]
 pub enum ListenError {
-    /// Somebody answers there.
+    /// Another process listens there.
     #[error("{0} is in use: another learner listens there; choose another run directory or address")]
     InUse(Address),
     /// The socket's path does not fit.
@@ -79,7 +79,7 @@ pub enum ListenError {
 /// Why a connection was not let in.
 #[derive(Debug, thiserror::Error)]
 pub enum Refused {
-    /// A process of somebody else.
+    /// Another user's process.
     #[error("it comes from user {0}, and this learner belongs to another")]
     OtherUser(u32),
     /// The system does not say whose it is.
@@ -115,7 +115,7 @@ impl Incoming {
     /// Listens. A socket file that a dead learner has left is replaced.
     ///
     /// # Errors
-    /// When somebody listens there already, or the system refuses.
+    /// When another process listens there already, or the system refuses.
     pub async fn bind(address: &Address) -> Result<Self, ListenError> {
         match address {
             Address::Unix(path) => Self::bind_unix(path).await,

@@ -1,7 +1,7 @@
 //! Addresses, and how to listen and connect, so that only those get in who may.
 //!
 //! A Unix socket in the run directory is always there: its folder has mode 700, it has mode 600 itself, the system is
-//! asked who calls, and the caller must know the run's token. TCP is there when somebody asks for it, and then:
+//! asked who calls, and the caller must know the run's token. TCP is there when the configuration asks for it, and then:
 //!
 //! | listens on | what callers must show |
 //! |---|---|
@@ -51,7 +51,7 @@ const LONG_CALL_TIMEOUT: Duration = Duration::from_secs(600);
 /// and HTTP/2's own 16 KiB would cut each piece of them into dozens of frames, with a system call or two for each.
 const FRAME_BYTES_MAX: u32 = 2 * crate::snapshot::PIECE_BYTES as u32;
 
-/// Without a word from the other side for so long, it is pinged.
+/// When the other side has been silent for so long, it is pinged.
 const KEEPALIVE_EVERY: Duration = Duration::from_secs(5);
 
 /// Without an answer to that for so long, the link is dead. Longer than a slow link needs for what is before the ping.

@@ -195,7 +195,7 @@ impl<S> Guarded<S> {
         let has_to_go = self.leave.as_mut().is_some_and(|leave| Pin::new(leave).poll(cx).is_ready());
         // It may have become known just now.
         if has_to_go && !self.place.is_known() {
-            return Err(io::Error::new(io::ErrorKind::TimedOut, "nobody knows who it is"));
+            return Err(io::Error::new(io::ErrorKind::TimedOut, "it did not authenticate in time"));
         }
         Ok(())
     }
@@ -248,7 +248,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn the_oldest_stranger_goes_and_nobody_who_is_known() {
+    async fn the_oldest_stranger_goes_and_known_callers_stay() {
         let places = places(2, 2);
         let (mine, _theirs) = tokio::io::duplex(1);
         let (place, leave) = places.stranger();

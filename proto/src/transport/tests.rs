@@ -177,7 +177,7 @@ async fn a_port_in_use_and_a_name_are_refused() {
 }
 
 #[tokio::test]
-async fn nobody_there_is_said_plainly() {
+async fn an_absent_learner_is_named() {
     let folder = tempfile::tempdir().unwrap();
     let address = Address::Unix(folder.path().join("learner.sock"));
     let error = connect(&address, &Credentials::token(TOKEN)).await.unwrap_err();
@@ -355,18 +355,18 @@ async fn another_user_is_not_heard() {
     // Folder and socket would keep others out already: here they are opened wide.
     fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o777)).unwrap();
     fs::set_permissions(&path, fs::Permissions::from_mode(0o777)).unwrap();
-    let as_nobody = tokio::task::spawn_blocking(move || {
+    let as_another = tokio::task::spawn_blocking(move || {
         // Of this thread alone, which ends with it.
         let thread = std::thread::spawn(move || {
-            let nobody = rustix::process::Uid::from_raw(65534);
-            rustix::thread::set_thread_res_uid(nobody, nobody, nobody).unwrap();
+            let another = rustix::process::Uid::from_raw(65534);
+            rustix::thread::set_thread_res_uid(another, another, another).unwrap();
             let mut stream = std::os::unix::net::UnixStream::connect(path).unwrap();
             // A server would begin with its settings.
             stream.read(&mut [0; 64])
         });
         thread.join().unwrap()
     });
-    assert!(matches!(as_nobody.await.unwrap(), Ok(0) | Err(_)), "closed without a word");
+    assert!(matches!(as_another.await.unwrap(), Ok(0) | Err(_)), "closed without an answer");
     connect(&server.address, &Credentials::token(TOKEN)).await.unwrap();
 }
 
@@ -396,7 +396,7 @@ async fn no_more_connections_than_there_are_places() {
 }
 
 #[tokio::test]
-async fn silent_connections_keep_nobody_out_and_are_closed() {
+async fn silent_connections_keep_no_known_caller_out_and_are_closed() {
     let pki = Pki::new();
     let (ca, authority) = pki.authority("ca.pem");
     let server = pki.identity("server", &authority, "127.0.0.1", false);
@@ -428,7 +428,7 @@ async fn silent_connections_keep_nobody_out_and_are_closed() {
 }
 
 #[tokio::test]
-async fn whoever_does_not_show_the_token_in_time_is_closed() {
+async fn a_caller_that_does_not_show_the_token_in_time_is_closed() {
     let mut limits = places(2, 4);
     limits.connections.deadline = Duration::from_millis(50);
     let learner = listen(&loopback(), Access::token(TOKEN), limits).await;

@@ -13,7 +13,7 @@ use rit_learner::{
     ledger::{Ledger, Terms},
     replay_log::ReplayLog,
     tensorboard::Position,
-    trainer::{Made, TrainError, Trainer, Work},
+    trainer::{Algorithm, Made, TrainError, Trainer, Work},
     weights::Snapshot,
     write_queue::write_queue,
 };
@@ -136,7 +136,8 @@ impl Run {
         let (to_write, _) = write_queue(0);
         let run_dir = self.run_dir.clone();
         let (config, made) = (self.config.clone(), Made::default());
-        let trainer = Trainer::new(config, run_dir, learner, loaded, Box::new(|_| ()), to_write, made);
+        let algorithm = Algorithm { model: Arc::clone(&self.model), learner };
+        let trainer = Trainer::new(config, run_dir, algorithm, loaded, Box::new(|_| ()), to_write, made);
         let Ok((trainer, board)) = trainer else { panic!("the trainer does not start") };
 
         let beginning = trainer.beginning();
@@ -217,12 +218,12 @@ fn path(run_dir: &RunDir, name: &str) -> PathBuf {
 
 fn learner(model: &Arc<Model>, config: &Config) -> Result<Box<dyn Learner>, Box<dyn std::error::Error>> {
     let params = model.initial(&mut config.seed.stream(Stream::Weights, 0));
-    Ok(rit_algo::learner(Arc::clone(model), config.update(), params)?)
+    Ok(model.learner(config.update(), params)?)
 }
 
 fn state(learner: &dyn Learner, config: &Config, origin: Origin) -> TrainingState {
     let params = learner.params().to_vec();
-    let acting = &params[learner.model().acting()];
+    let acting = &params[learner.acting()];
     let lag = config.algorithm.policy_lag as u64;
     TrainingState {
         best: None,

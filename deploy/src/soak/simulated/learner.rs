@@ -166,7 +166,7 @@ impl<M: Machines> World<M> {
             }
             Effect::Refuse(refusal) => {
                 let link = learner.joining.take()?;
-                if matches!(refusal, Refusal::Taken { .. } | Refusal::Name | Refusal::Layout { .. }) {
+                if matches!(refusal, Refusal::Taken { .. } | Refusal::Layout { .. }) {
                     self.breaks(format!("an actor of the supervisor was refused: {refusal}"));
                 }
                 // One that comes when the run is over looks for the next learner.

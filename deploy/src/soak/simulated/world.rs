@@ -88,7 +88,7 @@ pub enum What {
     Reaped(u32, Place, Exit),
     /// A process hears that it is to shut down gracefully.
     Asked(usize),
-    /// Somebody asks something of the learner.
+    /// A control call asks something of the learner.
     Control(Control),
     Look(usize),
     Trained(usize),
@@ -221,7 +221,7 @@ pub struct World<M: Machines> {
     pub may_fail: bool,
     /// A learner has answered this supervisor.
     pub begun: bool,
-    /// Somebody has ended the run before its time.
+    /// A fault has ended the run before its time.
     pub(super) may_end_early: bool,
     pub(super) latency_ms: u64,
     pub(super) rng: Rng,
