@@ -23,13 +23,13 @@ impl Slots {
         self.entities_max * self.entity_dim
     }
 
-    /// Writes what each agent sees, `[agent rows, m d]`: its own features, then the other slots in their order. An
-    /// agent sees itself always.
+    /// Writes what each agent sees, `[agent rows, m d]`: its own features, then the other slots in their order. What it
+    /// does not see is zeros, be it itself.
     pub fn observations(&self, rows: &Rows, observations: &mut Vec<f32>) {
         observations.clear();
         observations.resize(rows.agent_rows() * self.width(), 0.0);
         let mut inputs = observations.chunks_exact_mut(self.width());
-        let mut seen = rows.others.as_slice();
+        let mut seen = rows.observable.as_slice();
         for group in &rows.groups {
             let (n_agents, n_entities) = (group.queries.len(), group.keys.len());
             for (agent, input) in (0..n_agents).zip(&mut inputs) {
@@ -41,7 +41,7 @@ impl Slots {
                         slot if slot < agent => slot + 1,
                         slot => slot,
                     };
-                    if sees != 0 || entity == agent {
+                    if sees != 0 {
                         input[self.features(place)]
                             .copy_from_slice(features(rows, group.keys.start + entity));
                     }
@@ -84,8 +84,8 @@ mod tests {
     use crate::TerminalStates;
     use rit_episode::{End, Episode};
 
-    /// Two agents and another entity of features 1, 2, 3 in one state, 4, 5, 6 in the next; agent 1 does not see agent
-    /// 0 in the second.
+    /// Two agents and another entity of features 1, 2, 3 in one state, 4, 5, 6 in the next, 7, 8, 9 in the last. Agent 1
+    /// does not see agent 0 in the second; in the last it sees nothing, itself included.
     fn episode() -> Episode {
         Episode {
             number: 0,
@@ -94,12 +94,12 @@ mod tests {
             n_agents: 2,
             n_entities: 3,
             decision_order: vec![0, 1],
-            entities: vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
-            observable: vec![1, 1, 1, 1, 1, 1, 1, 1, 1, 0, 1, 1],
-            available: vec![1; 4],
-            actions: vec![0, 0],
-            rewards: vec![0.0],
-            shaping: vec![0.0],
+            entities: vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0],
+            observable: [[1, 1, 1, 1, 1, 1], [1, 1, 1, 0, 1, 1], [1, 1, 1, 0, 0, 0]].concat(),
+            available: vec![1; 6],
+            actions: vec![0; 4],
+            rewards: vec![0.0; 2],
+            shaping: vec![0.0; 2],
             end: End::Truncated,
             won: false,
         }
@@ -118,8 +118,12 @@ mod tests {
             [2.0, 1.0, 0.0, 3.0, 0.0],
             [4.0, 5.0, 0.0, 6.0, 0.0],
             [5.0, 0.0, 0.0, 6.0, 0.0],
+            [7.0, 8.0, 0.0, 9.0, 0.0],
+            [0.0; 5],
         ];
         assert_eq!(observations, expected.as_flattened());
-        assert_eq!(states, [1.0, 2.0, 0.0, 3.0, 0.0, 4.0, 5.0, 0.0, 6.0, 0.0]);
+        // The state holds all entities that are there, seen or not.
+        let expected = [[1.0, 2.0, 0.0, 3.0, 0.0], [4.0, 5.0, 0.0, 6.0, 0.0], [7.0, 8.0, 0.0, 9.0, 0.0]];
+        assert_eq!(states, expected.as_flattened());
     }
 }

@@ -7,7 +7,6 @@ use rit_algo::{
     Learner, Mappo, MappoActing, MappoConfig, Mat, MatActing, MatConfig, Method, Model, ModelConfig,
     PpoConfig, RoleConfig, TerminalStates, UpdateConfig,
     flat::Slots,
-    learner,
     learner::{Draw, NamedState},
     on_policy::{ActorCritic, Ppo},
 };
@@ -82,7 +81,7 @@ fn params(network: &impl ActorCritic) -> Vec<f32> {
     params
 }
 
-/// A state of noise; every third agent has no choice.
+/// A state of noise: some agents have no choice, some see nothing, themselves included.
 fn observation(n: usize, m: usize, rng: &mut Rng) -> Observation {
     let mut seen = Observation::new(n, m, SLOTS.entity_dim, A);
     for entity in 0..m {
@@ -91,6 +90,9 @@ fn observation(n: usize, m: usize, rng: &mut Rng) -> Observation {
     for agent in 0..n {
         seen.observable_mut(agent).fill_with(|| u8::from(rng.random_bool(0.7)));
         seen.observable_mut(agent)[agent] = 1;
+        if rng.random_bool(0.2) {
+            seen.observable_mut(agent).fill(0);
+        }
         seen.available_mut(agent).fill_with(|| u8::from(rng.random_bool(0.6)));
         seen.available_mut(agent)[0] = 1;
     }
@@ -361,7 +363,18 @@ impl Matrix for Mat {
 
 /// A learner at its beginning, with weights as above, and a batch of episodes.
 fn under_training(method: Method) -> (Box<dyn Learner>, Vec<Episode>) {
-    let model = Model::new(ModelConfig {
+    let model = Model::new(sizes(method)).unwrap();
+    let (mappo, mat) = (mappo(SLOTS, A, 8), mat(SLOTS, A, 8));
+    let (params, mut acting) = match method {
+        Method::Mappo => (params(&*mappo), mappo_acting(&mappo, &params(&*mappo))),
+        _ => (params(&*mat), mat_acting(&mat, &params(&*mat))),
+    };
+    let learner = model.learner(config(2), params).unwrap();
+    (learner, play(&mut *acting, &TEAMS).0)
+}
+
+fn sizes(method: Method) -> ModelConfig {
+    ModelConfig {
         method,
         encoder: method.facts().encoder,
         entity_dim: SLOTS.entity_dim,
@@ -379,14 +392,7 @@ fn under_training(method: Method) -> (Box<dyn Learner>, Vec<Episode>) {
         feedforward_dim: 0,
         imagined_weight: 0.0,
         role: RoleConfig::default(),
-    });
-    let (mappo, mat) = (mappo(SLOTS, A, 8), mat(SLOTS, A, 8));
-    let (params, mut acting) = match method {
-        Method::Mappo => (params(&*mappo), mappo_acting(&mappo, &params(&*mappo))),
-        _ => (params(&*mat), mat_acting(&mat, &params(&*mat))),
-    };
-    let learner = learner(Arc::new(model.unwrap()), config(2), params).unwrap();
-    (learner, play(&mut *acting, &TEAMS).0)
+    }
 }
 
 fn draw(update: u64) -> Draw {
@@ -437,9 +443,8 @@ fn what_is_not_finite_leaves_everything_as_it_was() {
 
 #[test]
 fn a_model_says_which_size_it_cannot_have() {
-    let (learner, _) = under_training(Method::Mat);
     let config = |change: fn(&mut ModelConfig)| {
-        let mut config = learner.model().config().clone();
+        let mut config = sizes(Method::Mat);
         change(&mut config);
         Model::new(config).map(|_| ()).map_err(|error| error.to_string())
     };

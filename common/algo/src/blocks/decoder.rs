@@ -361,3 +361,6 @@ vectorized! {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -132,3 +132,6 @@ impl Encoder {
         encoded
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -52,3 +52,6 @@ impl GaussianHead {
         NormalVars { mean: y.columns(0..dim), variance }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -215,3 +215,6 @@ fn slope_of_abs(w: f32) -> f32 {
         0.0
     }
 }
+
+#[cfg(test)]
+mod tests;

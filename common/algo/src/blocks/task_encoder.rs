@@ -55,3 +55,6 @@ impl TaskEncoder {
         (history, representation)
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,6 +1,9 @@
 //! MAPPO and MAT: what a batch's weights said, what the losses compare with, the losses, their gradients.
 
-use super::{Cells, OptimizerConfig, Padding, Report, Tensors};
+use super::{
+    Cells, Cut, OptimizerConfig, Padding, Report, Tensors, compare_gradients, compare_step, described,
+    stored_gradients,
+};
 use rit_algo::{
     Mappo, MappoActing, MappoConfig, Mat, MatActing, MatConfig, PpoConfig, TerminalStates, UpdateConfig,
     estimators::value_norm::ValueNorm,
@@ -8,9 +11,9 @@ use rit_algo::{
     on_policy::{ActorCritic, Losses, Ppo, Said, Targets},
 };
 use rit_episode::{Choice, Episode, Exploration, Observation, Policy, RunSeed, Stream, Turn};
-use rit_nn::{Optimizer, categorical, optimizer};
+use rit_nn::categorical;
 use serde::Deserialize;
-use std::{collections::HashMap, fs, path::Path, sync::Arc};
+use std::{collections::HashMap, sync::Arc};
 
 #[derive(Deserialize)]
 struct Case {
@@ -51,16 +54,13 @@ struct Method<N> {
     norms: &'static [&'static str],
 }
 
-/// Compares a case, cut into so many shards.
-pub fn compare(
-    folder: &Path,
-    algorithm: &str,
-    shards: usize,
-    terminal_states: TerminalStates,
-    report: &mut Report,
-) {
-    let case: Case = serde_json::from_slice(&fs::read(folder.join("case.json")).unwrap()).unwrap();
-    let size = |name: &str| case.config[name].as_u64().unwrap_or_else(|| panic!("config.{name}")) as usize;
+/// Compares a case.
+pub fn compare(cut: Cut<'_>, algorithm: &str, report: &mut Report) {
+    let case: Case = described(cut.folder);
+    let size = |name: &str| match case.config[name].as_u64() {
+        Some(size) => size as usize,
+        None => panic!("case.json: config.{name} is no size"),
+    };
     let slots = Slots {
         agents_max: size("agents_max"),
         entities_max: size("entities_max"),
@@ -74,14 +74,7 @@ pub fn compare(
                 act(&mut MappoActing::new(Arc::clone(network), params), episode, n_actions)
             };
             let norms = &["actor_grad_norm", "critic_grad_norm"];
-            compare_method(
-                folder,
-                &case,
-                Method { network, greedy, norms },
-                (shards, terminal_states),
-                slots,
-                report,
-            );
+            compare_method(cut, &case, Method { network, greedy, norms }, slots, report);
         }
         "mat" => {
             let network = Mat::new(MatConfig {
@@ -94,38 +87,19 @@ pub fn compare(
             let greedy = |network: &Arc<Mat>, params: &[f32], episode: &Episode, n_actions| {
                 act(&mut MatActing::new(Arc::clone(network), params), episode, n_actions)
             };
-            let norms = &["grad_norm"];
-            compare_method(
-                folder,
-                &case,
-                Method { network, greedy, norms },
-                (shards, terminal_states),
-                slots,
-                report,
-            );
+            compare_method(cut, &case, Method { network, greedy, norms: &["grad_norm"] }, slots, report);
         }
-        other => panic!("{}: unknown algorithm {other}", folder.display()),
+        other => panic!("unknown algorithm {other}"),
     }
 }
 
-fn compare_method<N: ActorCritic>(
-    folder: &Path,
-    case: &Case,
-    method: Method<N>,
-    (shards, terminal_states): (usize, TerminalStates),
-    slots: Slots,
-    report: &mut Report,
-) {
-    let read = |name: &str| Tensors(fs::read(folder.join(name).with_extension("safetensors")).unwrap());
-    let (batch, expected, gradients) = (read("batch"), read("expected"), read("gradients"));
-    let network = Arc::new(method.network);
-    let n_actions = network.n_actions();
-    let (kind, lr) = case.optimizer.kind();
-    let config = UpdateConfig {
+fn update_config(case: &Case, shards: usize, terminal_states: TerminalStates) -> UpdateConfig {
+    let (optimizer, lr) = case.optimizer.kind();
+    UpdateConfig {
         gamma: case.gamma,
         reward_scale: 1.0,
         lr,
-        optimizer: kind,
+        optimizer,
         grad_norm_clip: case.grad_norm_clip,
         shards,
         threads: 2,
@@ -140,92 +114,97 @@ fn compare_method<N: ActorCritic>(
             minibatches: case.minibatches,
             value_norm_beta: case.value_norm.beta,
         },
-    };
-    let padding = Padding {
-        entity_dim: slots.entity_dim,
-        n_actions,
-        agents_max: slots.agents_max,
-        entities_max: slots.entities_max,
-    };
-    let cells = Cells::read(&batch, padding);
+    }
+}
+
+fn compare_method<N: ActorCritic>(
+    cut: Cut<'_>,
+    case: &Case,
+    method: Method<N>,
+    slots: Slots,
+    report: &mut Report,
+) {
+    let Cut { folder, shards, terminal_states } = cut;
+    let (batch, expected) = (Tensors::read(folder, "batch"), Tensors::read(folder, "expected"));
+    let network = Arc::new(method.network);
+    let (layout, n_actions) = (network.layout(), network.n_actions());
+    let Slots { agents_max, entities_max, entity_dim } = slots;
+    let cells = Cells::read(&batch, Padding { entity_dim, n_actions, agents_max, entities_max });
+    cells.assert_in_slots();
     let episodes: Vec<Episode> = (0..cells.episodes()).map(|index| cells.episode(&batch, index)).collect();
     let batch_of: Vec<&Episode> = episodes.iter().collect();
-    let flat = |tensors: &Tensors| super::flat(network.layout(), tensors, 0..network.layout().len());
+    let weights = |name: &str| Tensors::read(folder, name).params(layout.params(), None);
 
     // Once per batch, with the weights that rolled it.
-    let mut ppo = Ppo::new(Arc::clone(&network), config, flat(&read("start_weights"))).unwrap();
+    let config = update_config(case, shards, terminal_states);
+    let mut ppo = Ppo::new(Arc::clone(&network), config, weights("start_weights")).unwrap();
     let Averages { mean, mean_square, debias } = case.value_norm.before;
     ppo.value_norm = ValueNorm { mean, mean_square, debias };
-    let sampled = sampled_actions(&mut ppo, &cells, &batch, &episodes, n_actions);
+    let sampled = expected
+        .holds("sampled_actions")
+        .then(|| sampled_actions(&mut ppo, &cells, &batch, &episodes, n_actions));
     let said = ppo.said(&batch_of);
     let targets = ppo.targets(&batch_of, said);
-    let after = &case.value_norm.after;
-    report.values("value_norm.mean", &[ppo.value_norm.mean as f32], &[after.mean as f32]);
-    report.values(
-        "value_norm.mean_square",
-        &[ppo.value_norm.mean_square as f32],
-        &[after.mean_square as f32],
-    );
-    report.values("value_norm.debias", &[ppo.value_norm.debias as f32], &[after.debias as f32]);
+    compare_value_norm(&ppo.value_norm, &case.value_norm.after, report);
 
     // Somewhere in the epochs.
-    ppo.params = flat(&read("weights"));
+    ppo.params = weights("weights");
     let said = ppo.said(&batch_of);
     let greedy: Vec<Vec<u8>> = episodes
         .iter()
         .map(|episode| (method.greedy)(&network, &ppo.params[network.acting()], episode, n_actions))
         .collect();
+    let losses =
+        ppo.gradients(&batch_of, &targets, &first_minibatch(&batch, episodes.len(), case.minibatches));
+    let scalars = scalars(&losses, method.norms);
+    for (name, &theirs) in &case.scalars {
+        report.scalar(name, &scalars, theirs);
+    }
+    let sampled = sampled.unwrap_or_default();
     let networks = Networks { targets: &targets, said: &said, sampled: &sampled, greedy: &greedy };
-    networks.compare(&cells, &expected, terminal_states, report);
+    networks.compare(&cells, &expected, &scalars, terminal_states, report);
+    let stored = stored_gradients(folder, layout);
+    compare_gradients(layout, ppo.grads(), &stored, report);
+    let optimizer = (&case.optimizer, case.grad_norm_clip);
+    compare_step(folder, layout, &ppo.params, stored, &network.clipped_apart(), optimizer, report);
+}
 
-    let permutation = batch.i32("permutation");
-    let first: Vec<usize> =
-        permutation[..episodes.len() / case.minibatches].iter().map(|&episode| episode as usize).collect();
-    let losses = ppo.gradients(&batch_of, &targets, &first);
-    compare_losses(&losses, &case.scalars, method.norms, report);
-    for param in network.layout().params() {
-        let name = format!("gradient of {}", param.name);
-        report.gradients(&name, &ppo.grads()[param.range.clone()], &gradients.f32(&param.name));
-    }
-
-    // The optimiser, fed with the stored gradients.
-    let mut stored = flat(&gradients);
-    for part in network.clipped_apart() {
-        let norm = optimizer::sum_of_squares(&stored[part.clone()]).sqrt();
-        let scale = optimizer::clip_scale(norm, case.grad_norm_clip);
-        stored[part].iter_mut().for_each(|grad| *grad *= scale);
-    }
-    let mut stepped = ppo.params.clone();
-    Optimizer::new(kind, lr, stepped.len()).step(&mut stepped, &stored, 1.0);
-    let after = read("weights_after_step");
-    for param in network.layout().params() {
-        let name = format!("{} after one step", param.name);
-        report.values(&name, &stepped[param.range.clone()], &after.f32(&param.name));
+fn compare_value_norm(ours: &ValueNorm, theirs: &Averages, report: &mut Report) {
+    for (name, ours, theirs) in [
+        ("mean", ours.mean, theirs.mean),
+        ("mean_square", ours.mean_square, theirs.mean_square),
+        ("debias", ours.debias, theirs.debias),
+    ] {
+        report.values(&format!("value_norm.{name}"), &[ours as f32], &[theirs as f32]);
     }
 }
 
-fn compare_losses(
-    losses: &Losses,
-    scalars: &HashMap<String, f64>,
-    norms: &'static [&'static str],
-    report: &mut Report,
-) {
+/// The episodes whose losses the case has. Where the batch does not say, they are in order.
+fn first_minibatch(batch: &Tensors, episodes: usize, minibatches: usize) -> Vec<usize> {
+    let permutation: Vec<usize> = if batch.holds("permutation") {
+        batch.i32("permutation").into_iter().map(|episode| episode as usize).collect()
+    } else {
+        (0..episodes).collect()
+    };
+    permutation[..episodes / minibatches].to_vec()
+}
+
+/// What a step reports, by name.
+fn scalars(losses: &Losses, norms: &'static [&'static str]) -> HashMap<&'static str, f64> {
+    let whole = losses.grad_norms.iter().map(|norm| norm * norm).sum::<f64>().sqrt();
     let of_losses = [
         ("policy_loss", losses.sums.policy_loss),
         ("entropy", losses.sums.entropy),
         ("value_loss", losses.sums.value_loss),
         ("loss", losses.loss),
+        ("ratio_mean", losses.sums.ratio),
+        ("clipped_share", losses.sums.clipped),
+        ("kl", losses.sums.kl),
+        ("grad_norm", whole),
     ];
     let of_norms = norms.iter().copied().zip(losses.grad_norms.iter().copied());
-    let ours: HashMap<&str, f64> = of_losses.into_iter().chain(of_norms).collect();
-    assert_eq!(ours.len(), scalars.len(), "as many as the reference has");
-    for (name, theirs) in scalars {
-        report.values(name, &[ours[name.as_str()] as f32], &[*theirs as f32]);
-    }
+    of_losses.into_iter().chain(of_norms).collect()
 }
-
-/// A tensor's part of an episode.
-type OfEpisode<'a> = &'a dyn Fn(usize) -> Vec<f32>;
 
 /// What the networks said of each episode, and what follows.
 struct Networks<'a> {
@@ -241,55 +220,70 @@ impl Networks<'_> {
         &self,
         cells: &Cells,
         expected: &Tensors,
+        scalars: &HashMap<&str, f64>,
         terminal_states: TerminalStates,
         report: &mut Report,
     ) {
-        let Self { targets, said, sampled, greedy } = *self;
-        let f32s = |values: &[f64]| values.iter().map(|&x| x as f32).collect();
-        let of_values: [(&str, OfEpisode<'_>); 8] = [
-            ("old_log_probs", &|at| targets[at].old.log_probs.clone()),
-            ("advantages", &|at| f32s(&targets[at].advantages)),
-            ("returns", &|at| f32s(&targets[at].returns)),
-            ("value_targets", &|at| targets[at].value_targets.clone()),
-            ("normalized_advantages", &|at| targets[at].normalized_advantages.clone()),
-            ("logits", &|at| said[at].logits.clone()),
-            ("log_probs", &|at| said[at].log_probs.clone()),
-            ("entropies", &|at| said[at].entropies.clone()),
-        ];
-        for (name, of_episode) in of_values {
-            let theirs = expected.f32(name);
-            report.values(name, &cells.padded(of_episode, theirs.len(), 0), &theirs);
-        }
-        // The states after the last step are there where they are kept.
-        if terminal_states == TerminalStates::Kept {
-            let of_states: [(&str, OfEpisode<'_>); 2] = [
-                ("old_values", &|at| targets[at].old.values.clone()),
-                ("values", &|at| said[at].values.clone()),
-            ];
-            for (name, of_episode) in of_states {
-                let theirs = expected.f32(name);
-                report.values(name, &cells.padded(of_episode, theirs.len(), 1), &theirs);
+        for (name, shape) in expected.shapes() {
+            let theirs = expected.f32(&name);
+            if shape.len() < 2 {
+                report.scalar(&name, scalars, theirs[0].into());
+                continue;
+            }
+            // The states after the last step are there where they are kept.
+            let of_states = matches!(name.as_str(), "old_values" | "values");
+            if of_states && terminal_states == TerminalStates::LeftOut {
+                continue;
+            }
+            let ours = cells.padded(|at| self.of_episode(&name, at), theirs.len(), usize::from(of_states));
+            match name.as_str() {
+                "chooses" | "sampled_actions" | "greedy_actions" => report.equal(&name, &ours, &theirs),
+                _ => report.values(&name, &ours, &theirs),
             }
         }
-        let chooses = |at: usize| targets[at].chooses.iter().map(|&flag| f32::from(u8::from(flag))).collect();
-        let theirs = expected.f32("chooses");
-        report.equal("chooses", &cells.padded(&chooses, theirs.len(), 0), &theirs);
-        for (name, actions) in [("sampled_actions", sampled), ("greedy_actions", greedy)] {
-            let of_episode = |at: usize| actions[at].iter().map(|&action| f32::from(action)).collect();
-            let theirs: Vec<f32> = expected.i32(name).into_iter().map(|action| action as f32).collect();
-            report.equal(name, &cells.padded(&of_episode, theirs.len(), 0), &theirs);
+    }
+
+    /// An expected tensor's part of an episode.
+    fn of_episode(&self, name: &str, at: usize) -> Vec<f32> {
+        let (targets, said) = (&self.targets[at], &self.said[at]);
+        let of_f64 = |numbers: &[f64]| numbers.iter().map(|&number| number as f32).collect();
+        let of_actions = |actions: &[u8]| actions.iter().map(|&action| f32::from(action)).collect();
+        match name {
+            "old_log_probs" => targets.old.log_probs.clone(),
+            "old_values" => targets.old.values.clone(),
+            "advantages" => of_f64(&targets.advantages),
+            "returns" => of_f64(&targets.returns),
+            "value_targets" => targets.value_targets.clone(),
+            "normalized_advantages" => targets.normalized_advantages.clone(),
+            "chooses" => targets.chooses.iter().map(|&flag| f32::from(u8::from(flag))).collect(),
+            "logits" => said.logits.clone(),
+            "log_probs" => said.log_probs.clone(),
+            "entropies" => said.entropies.clone(),
+            "values" => said.values.clone(),
+            "sampled_actions" => of_actions(&self.sampled[at]),
+            "greedy_actions" => of_actions(&self.greedy[at]),
+            _ => panic!("expected.safetensors: nothing says {name}"),
         }
     }
 }
 
 impl Cells {
+    /// Inputs of fixed length have a slot for each row, so rows must lie where the specification puts them.
+    fn assert_in_slots(&self) {
+        let first = self.padding.agents_max;
+        for (agents, entities) in self.agents.iter().zip(&self.entities) {
+            let (n, m) = (agents.len(), entities.len());
+            let in_order = (0..n).chain(first..first + m - n);
+            assert!(entities.iter().copied().eq(in_order), "batch.safetensors: rows between absent ones");
+        }
+    }
+
     /// A tensor of `len` numbers over the batch's steps and so many more, from each episode's own; zeros elsewhere.
-    fn padded(&self, of_episode: OfEpisode<'_>, len: usize, more_steps: usize) -> Vec<f32> {
+    fn padded(&self, of_episode: impl Fn(usize) -> Vec<f32>, len: usize, more_steps: usize) -> Vec<f32> {
         let times = self.steps_max + more_steps;
         let width = len / (self.episodes() * times);
         let mut padded = vec![0.0; len];
         for (index, padded) in padded.chunks_exact_mut(times * width).enumerate() {
-            assert!(self.agents[index].iter().copied().eq(0..self.agents[index].len()), "agents come first");
             let own = of_episode(index);
             let own = own.chunks_exact(own.len() / (self.steps[index] + more_steps));
             for (own, padded) in own.zip(padded.chunks_exact_mut(width)) {

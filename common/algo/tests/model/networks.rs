@@ -177,7 +177,7 @@ impl<N: Drawn> Networks<N> {
     }
 
     fn with(&self, config: UpdateConfig, params: Vec<f32>) -> TdLearner<N> {
-        TdLearner::new(Arc::clone(&self.model), Arc::clone(&self.network), config, params).unwrap()
+        TdLearner::new(Arc::clone(&self.network), config, params).unwrap()
     }
 
     fn update(shards: usize, threads: usize) -> UpdateConfig {

@@ -1,7 +1,7 @@
 //! What the decoder knows of its tokens, for one set of weights.
 
 use super::Decoder;
-use rit_nn::{Accum, View, ViewMut, activation, math, matmul, vectorized};
+use rit_nn::{Accum, View, ViewMut, activation, linear, math, matmul, vectorized};
 use std::ops::Range;
 
 /// What the decoder knows of its tokens, for one set of weights. K = A + 1 tokens, H heads.
@@ -98,14 +98,14 @@ impl Decoder {
                 attention.query.weight_mut(grads).rows(columns.clone()),
                 Accum::Add,
             );
-            add_weighted_rows(&mut attention.query.bias_mut(grads)[columns.clone()], d_bias, keys);
+            linear::add_weighted_rows(&mut attention.query.bias_mut(grads)[columns.clone()], d_bias, keys);
             let weight = self.head_hidden.weight_mut(grads).columns(context.clone());
             matmul::dyt_x(d_contexts, values, weight, Accum::Add);
 
             let mut d_keys = ViewMut::dense(&mut d.key_values, 2 * a).columns(columns.clone());
             let query = attention.query.weight(params).rows(columns.clone());
             matmul::x_wt(d_scores, query, d_keys.reborrow(), Accum::Replace);
-            add_outer_product(d_keys, d_bias, &attention.query.bias(params)[columns.clone()]);
+            linear::add_outer_product(d_keys, d_bias, &attention.query.bias(params)[columns.clone()]);
             let d_values =
                 ViewMut::dense(&mut d.key_values, 2 * a).columns(a + columns.start..a + columns.end);
             let weight = self.head_hidden.weight(params).columns(context);
@@ -137,24 +137,6 @@ vectorized! {
     /// Appends scale · row · vector for every row.
     fn push_products<'a>(to: &'a mut Vec<f32>, scale: f32, rows: View<'a>, vector: &'a [f32]) {
         to.extend((0..rows.rows).map(|row| scale * math::dot(rows.row(row), vector)));
-    }
-}
-
-vectorized! {
-    /// sum += Σ weight · row.
-    fn add_weighted_rows<'a>(sum: &'a mut [f32], weights: &'a [f32], rows: View<'a>) {
-        for (row, &weight) in weights.iter().enumerate() {
-            math::add_scaled(sum, weight, rows.row(row));
-        }
-    }
-}
-
-vectorized! {
-    /// row += weight · vector, for every row.
-    fn add_outer_product<'a>(rows: ViewMut<'a>, weights: &'a [f32], vector: &'a [f32]) {
-        for (row, &weight) in weights.iter().enumerate() {
-            math::add_scaled(rows.row(row), weight, vector);
-        }
     }
 }
 
