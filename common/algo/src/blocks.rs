@@ -6,6 +6,8 @@ mod encoder;
 mod gaussian_head;
 mod mixer;
 mod task_encoder;
+#[cfg(test)]
+mod testing;
 
 pub use decoder::{Decoder, DecoderPass};
 pub use discriminator::{Discriminator, draw_pairing};

@@ -141,15 +141,21 @@ impl ModelConfig {
             ("entity_dim", self.entity_dim),
             ("n_actions", self.n_actions),
             ("hidden_dim", self.hidden_dim),
-            ("n_heads", self.n_heads),
         ];
+        // MAPPO attends to nothing.
+        if self.method != Method::Mappo {
+            sizes.push(("n_heads", self.n_heads));
+        }
         match facts.encoder {
-            Encoder::Flat => sizes.extend([
-                ("agents_max", self.agents_max),
-                ("entities_max", self.entities_max),
-                ("n_blocks", self.n_blocks),
-            ]),
-            _ => sizes.push(("attention_dim", self.attention_dim)),
+            Encoder::Flat => {
+                sizes.extend([("agents_max", self.agents_max), ("entities_max", self.entities_max)]);
+            }
+            Encoder::Beside | Encoder::Within | Encoder::Tokens => {
+                sizes.push(("attention_dim", self.attention_dim));
+            }
+        }
+        if self.method == Method::Mat {
+            sizes.push(("n_blocks", self.n_blocks));
         }
         if facts.task_representations {
             sizes.extend([

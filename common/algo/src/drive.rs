@@ -2,15 +2,16 @@
 //! objectives, one step of the optimiser; and acting.
 
 mod acting;
+mod by_utilities;
 mod pairs;
 pub(crate) mod shards;
 pub mod td;
 mod values;
 
 pub use acting::ValueActing;
+pub(crate) use by_utilities::ByUtilities;
 pub use shards::{Sums, tree_sum, tree_sum_f64};
 pub use td::{
     Head, Pass, Role, Said, SeenShard, TdLearner, TdPass, Totals, Utilities, ValueNetwork, ValueParts,
     measures,
 };
-pub use values::EpisodeValues;

@@ -1,9 +1,10 @@
 //! What a trainer knows of an algorithm: it takes batches of episodes and has weights to act with. Everything else
 //! that it has, it declares: numbers to watch, and numbers that a checkpoint must hold.
 
-use crate::{Model, Regime};
+use crate::Regime;
 use rit_episode::{Episode, RunSeed, Stream, streams::Rng};
-use std::{borrow::Cow, sync::Arc};
+use rit_nn::Layout;
+use std::{borrow::Cow, ops::Range};
 
 /// A number that an update reports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,6 +45,7 @@ impl NotFinite {
     /// # Errors
     /// The first that is not.
     pub fn check(measures: &[Measure], values: &[f64]) -> Result<(), Self> {
+        debug_assert_eq!(measures.len(), values.len(), "a value for each measure");
         let mut named = measures.iter().zip(values);
         let found = named.find(|(_, value)| !value.is_finite());
         found.map_or(Ok(()), |(measure, _)| Err(Self { what: measure.name }))
@@ -173,13 +175,14 @@ pub fn restore(places: Vec<(&'static str, Place<'_>)>, state: &[NamedState<'_>])
 
 /// An algorithm under training: all that a trainer knows of it.
 pub trait Learner: Send {
-    /// The model that it trains.
-    fn model(&self) -> &Arc<Model>;
-
     /// What it learns from.
-    fn regime(&self) -> Regime {
-        self.model().method().facts().regime
-    }
+    fn regime(&self) -> Regime;
+
+    /// Names and shapes of all parameters.
+    fn layout(&self) -> &Layout;
+
+    /// The parameters that acting needs.
+    fn acting(&self) -> Range<usize>;
 
     /// What an update reports, in the order of its values.
     fn measures(&self) -> &'static [Measure];
@@ -252,5 +255,14 @@ mod tests {
         let error = NotFinite::check(&measures, &[1.0, f64::NAN]).unwrap_err();
         assert_eq!(error.to_string(), "grad_norm is not finite");
         assert_eq!(NotFinite::check(&measures, &[f64::INFINITY, 0.0]), Err(NotFinite { what: "td_loss" }));
+    }
+
+    /// Values have no names but by their places: one too few would give every later one another's.
+    #[test]
+    #[cfg(debug_assertions)]
+    #[should_panic(expected = "a value for each measure")]
+    fn a_measure_without_a_value_is_noticed() {
+        let measures = [Measure { name: "td_loss", help: "" }, Measure { name: "grad_norm", help: "" }];
+        let _ = NotFinite::check(&measures, &[1.0]);
     }
 }

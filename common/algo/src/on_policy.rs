@@ -4,10 +4,12 @@
 //! targets and the value normaliser follow (`on_policy/targets.rs`). Then come `epochs` × `minibatches` optimiser steps
 //! on the clipped losses (`on_policy/loss.rs`). Between batches nothing is kept but weights, moments and the normaliser.
 
+mod by_policy;
 mod learner;
 mod loss;
 mod targets;
 
+pub(crate) use by_policy::ByPolicy;
 pub use learner::PpoLearner;
 pub(crate) use learner::measures;
 pub use loss::Sums;
@@ -19,6 +21,7 @@ use crate::{
     drive::{shards, tree_sum, tree_sum_f64},
     estimators::value_norm::ValueNorm,
     learner::Measure,
+    networks::Actor,
 };
 use loss::Counts;
 use rand::{Rng, seq::SliceRandom as _};
@@ -30,10 +33,10 @@ use rit_nn::{
     categorical, optimizer,
     tape::{Stock, Tape, Var},
 };
-use std::{ops::Range, sync::Arc};
+use std::{fmt::Debug, ops::Range, sync::Arc};
 
 /// An actor-critic's networks: all that this objective knows of a method.
-pub trait ActorCritic: Send + Sync {
+pub trait ActorCritic: Debug + Send + Sync + 'static {
     /// Names and shapes of all parameters.
     fn layout(&self) -> &Layout;
 
@@ -57,6 +60,12 @@ pub trait ActorCritic: Send + Sync {
 
     /// Logits and values of all rows, given the actions taken.
     fn forward<'a>(&self, tape: &mut Tape<'a>, inputs: &'a Inputs) -> Outputs;
+
+    /// The networks choosing joint actions with these acting parameters.
+    ///
+    /// # Panics
+    /// When there are not as many as acting needs.
+    fn actor(self: Arc<Self>, params: &[f32]) -> Box<dyn Actor>;
 }
 
 /// What a value belongs to.

@@ -7,7 +7,7 @@ use crate::{
         Decoder, DecoderPass,
         decoder::{Seen, Tables, best},
     },
-    methods::Actor,
+    networks::Actor,
 };
 use rit_episode::{Policy, Turn};
 use rit_nn::{Stock, Tape, View, vectorized};

@@ -18,7 +18,7 @@ use super::{
     shards::{Sums, Workers, part, pool, tree_sum},
 };
 use crate::{
-    Model, Rows, UpdateConfig,
+    Rows, UpdateConfig,
     blocks::{
         Decoder, DecoderPass, Discriminator, Mixer, MixerWeights, TaskEncoder,
         decoder::{Tables, best},
@@ -29,7 +29,7 @@ use rayon::{ThreadPool, ThreadPoolBuildError, prelude::*};
 use rit_episode::{Episode, Turn};
 use rit_nn::{Layout, Optimizer, Tape, Var, View, optimizer};
 use shard::{Represented, Shard, ShardInputs, Update, Weights};
-use std::{mem, ops::Range, sync::Arc};
+use std::{fmt::Debug, mem, ops::Range, sync::Arc};
 
 /// What the engine must know of every network that has utilities.
 #[derive(Clone, Debug)]
@@ -150,7 +150,7 @@ pub struct TdPass<'a, 'p, N: ValueNetwork> {
 pub type Said = Vec<(&'static str, Var)>;
 
 /// A network that values actions: a method that learns by temporal differences.
-pub trait ValueNetwork: Send + Sync + 'static {
+pub trait ValueNetwork: Debug + Send + Sync + 'static {
     /// Random numbers of an update, beside the contrastive loss's pairing.
     type Draws: Send + Sync + Default;
     /// What passes over some rows read beside them: what was drawn, as the rows lie.
@@ -159,12 +159,14 @@ pub trait ValueNetwork: Send + Sync + 'static {
     type Extras: Send;
     /// Whether the gradients of the method's own losses need sums over the whole batch.
     const COUPLED: bool = false;
+    /// Whether a pass needs random numbers, so that an episode that is over cannot be valued anew.
+    const DRAWS: bool = false;
 
     /// What the engine must know.
     fn parts(&self) -> &ValueParts;
 
     /// What an update reports: `td_loss`, `contrastive_loss` where there is one, the method's own, `grad_norm`,
-    /// `q_total_mean`, `target_mean`, and `saturated_units` of a GRU.
+    /// `q_total_mean`, `target_mean`, and `saturated_units` of a GRU. [`measures::measures`] puts them together.
     fn measures(&self) -> &'static [Measure];
 
     /// What the decoder makes of these weights; nothing without a decoder.
@@ -224,7 +226,6 @@ pub trait ValueNetwork: Send + Sync + 'static {
 
 /// Weights under training, with everything an update needs.
 pub struct TdLearner<N: ValueNetwork> {
-    model: Arc<Model>,
     network: Arc<N>,
     config: UpdateConfig,
     pool: ThreadPool,
@@ -255,7 +256,6 @@ impl<N: ValueNetwork> TdLearner<N> {
     /// # Panics
     /// When `params` is not of the layout's length.
     pub fn new(
-        model: Arc<Model>,
         network: Arc<N>,
         config: UpdateConfig,
         params: Vec<f32>,
@@ -274,7 +274,6 @@ impl<N: ValueNetwork> TdLearner<N> {
             pairs: Pairs::default(),
             workers: Workers::default(),
             pool: pool(config.threads)?,
-            model,
             network,
             config,
             params,
@@ -357,6 +356,8 @@ impl<N: ValueNetwork> TdLearner<N> {
             let units = update.totals.filled_agents * network.parts().memory_dim;
             measures.push(saturated / units as f64);
         }
+        // Names are given to them by their places.
+        debug_assert_eq!(measures.len(), network.measures().len(), "a value for each measure");
         measures
     }
 

@@ -2,38 +2,12 @@
 //! actions, those taken or others in the same states.
 
 use super::td::{Pass, Role, Utilities, ValueNetwork};
-use crate::{Model, Rows, model::Network, rows::TerminalStates};
+use crate::{Rows, networks::EpisodeValues, rows::TerminalStates};
 use rit_episode::{Action, Episode};
 use rit_nn::{Stock, Tape};
 
-/// Values of an episode of n agents and T steps, agents in decision order.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct EpisodeValues {
-    /// z, `[T, n, h_z]`; empty where a method has none.
-    pub representations: Vec<f32>,
-    /// Each agent's utility of its action, given those before it, `[T, n]`.
-    pub utilities: Vec<f32>,
-    /// Q_total of each joint action, `[T]`.
-    pub q_total: Vec<f32>,
-}
-
-impl Model {
-    /// Values the joint actions `[T, n]`, each in the episode's state at that step. The agents' memories are those of the
-    /// actions that were really taken. Returns `None` for methods without utilities, and for REFIL and ROMA.
-    ///
-    /// # Panics
-    /// When `params` or `actions` are not as many as there are parameters or actions taken.
-    pub fn value(&self, params: &[f32], episode: &Episode, actions: &[Action]) -> Option<EpisodeValues> {
-        assert_eq!(actions.len(), episode.actions.len(), "an action for each agent and step");
-        match &self.network {
-            Network::Recurrent(network) => Some(value(network.as_ref(), params, episode, actions)),
-            Network::Updet(network) => Some(value(network.as_ref(), params, episode, actions)),
-            Network::Refil(_) | Network::Roma(_) | Network::Mappo(_) | Network::Mat(_) => None,
-        }
-    }
-}
-
-fn value<N: ValueNetwork>(
+/// Values the joint actions `[T, n]` of an episode, see [`Model::value`](crate::Model::value).
+pub(super) fn value<N: ValueNetwork>(
     network: &N,
     params: &[f32],
     episode: &Episode,

@@ -8,13 +8,14 @@ use crate::{
     Rows,
     flat::Slots,
     learner::Measure,
+    networks::Actor,
     on_policy::{self, ActorCritic, Inputs, Outputs, ValueRows},
 };
 use rit_nn::{
     Gru, LayerNorm, Layout, LayoutBuilder, Linear, View,
     tape::{Tape, Var},
 };
-use std::{f32::consts::SQRT_2, ops::Range};
+use std::{f32::consts::SQRT_2, ops::Range, sync::Arc};
 
 /// What an update reports.
 const MEASURES: [Measure; 10] = on_policy::measures([
@@ -99,6 +100,10 @@ impl ActorCritic for Mappo {
         let (_, logits) = self.actor.forward(tape, observations, &inputs.rows.agent_times, None);
         let (_, values) = self.critic.forward(tape, states, &inputs.rows.group_times, None);
         Outputs { logits, values }
+    }
+
+    fn actor(self: Arc<Self>, params: &[f32]) -> Box<dyn Actor> {
+        Box::new(MappoActing::new(self, params))
     }
 }
 

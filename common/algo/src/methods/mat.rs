@@ -8,6 +8,7 @@ pub use acting::MatActing;
 use crate::{
     flat::Slots,
     learner::Measure,
+    networks::Actor,
     on_policy::{self, ActorCritic, Inputs, Outputs, ValueRows},
 };
 use rit_nn::{
@@ -15,7 +16,7 @@ use rit_nn::{
     attention::{Group, Visible},
     tape::{Tape, Var},
 };
-use std::{f32::consts::SQRT_2, ops::Range};
+use std::{f32::consts::SQRT_2, ops::Range, sync::Arc};
 
 /// What an update reports.
 const MEASURES: [Measure; 9] =
@@ -181,6 +182,10 @@ impl ActorCritic for Mat {
             x = block.forward(tape, x, projected, encoded, &inputs.teams, before);
         }
         Outputs { logits: self.head.forward(tape, x), values }
+    }
+
+    fn actor(self: Arc<Self>, params: &[f32]) -> Box<dyn Actor> {
+        Box::new(MatActing::new(self, params))
     }
 }
 

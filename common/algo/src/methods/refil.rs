@@ -22,14 +22,8 @@ use rit_nn::{
 /// Passes that go through an episode in training: the real one, within the own group, and across groups.
 const PASSES: usize = 3;
 
-const MEASURES: [Measure; 6] = [
-    measures::TD_LOSS,
-    Measure { name: "imagined_loss", help: "TD loss of imagined sub-groups" },
-    measures::GRAD_NORM,
-    measures::Q_TOTAL_MEAN,
-    measures::TARGET_MEAN,
-    measures::SATURATED_UNITS,
-];
+const MEASURES: [Measure; 6] =
+    measures::measures([Measure { name: "imagined_loss", help: "TD loss of imagined sub-groups" }], true);
 
 /// The utility network, and all else in [`ValueParts`].
 #[derive(Clone, Debug)]
@@ -122,6 +116,7 @@ impl ValueNetwork for Refil {
     type Draws = Groups;
     type Inputs = Imagined;
     type Extras = Option<Var>;
+    const DRAWS: bool = true;
 
     fn parts(&self) -> &ValueParts {
         &self.parts

@@ -16,17 +16,21 @@ use rit_nn::{
     random::fill_standard_normal,
 };
 
-const MEASURES: [Measure; 9] = [
-    measures::TD_LOSS,
-    Measure { name: "role_loss", help: "Role loss: softplus of the weighted role entropy and divergence" },
-    Measure { name: "role_entropy", help: "Mean entropy of roles" },
-    Measure { name: "role_kl", help: "Mean divergence of roles from their posterior" },
-    Measure { name: "dissimilarity_loss", help: "Loss of roles that are neither informative nor dissimilar" },
-    measures::GRAD_NORM,
-    measures::Q_TOTAL_MEAN,
-    measures::TARGET_MEAN,
-    measures::SATURATED_UNITS,
-];
+const MEASURES: [Measure; 9] = measures::measures(
+    [
+        Measure {
+            name: "role_loss",
+            help: "Role loss: softplus of the weighted role entropy and divergence",
+        },
+        Measure { name: "role_entropy", help: "Mean entropy of roles" },
+        Measure { name: "role_kl", help: "Mean divergence of roles from their posterior" },
+        Measure {
+            name: "dissimilarity_loss",
+            help: "Loss of roles that are neither informative nor dissimilar",
+        },
+    ],
+    true,
+);
 
 /// The utility network with its roles, and all else in [`ValueParts`].
 #[derive(Clone, Debug)]
@@ -146,6 +150,7 @@ impl ValueNetwork for Roma {
     type Inputs = RoleInputs;
     type Extras = Option<Roles>;
     const COUPLED: bool = true;
+    const DRAWS: bool = true;
 
     fn parts(&self) -> &ValueParts {
         &self.parts

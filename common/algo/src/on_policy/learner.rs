@@ -2,13 +2,14 @@
 
 use super::{ActorCritic, Losses, Ppo};
 use crate::{
-    Learner, Model, UpdateConfig,
+    Learner, Regime, UpdateConfig,
     estimators::value_norm::ValueNorm,
     learner::{Draw, Measure, NamedState, NotFinite, Numbers, Place, StateError, restore},
 };
 use rayon::ThreadPoolBuildError;
 use rit_episode::{Episode, Stream};
-use std::{slice, sync::Arc};
+use rit_nn::Layout;
+use std::{ops::Range, slice, sync::Arc};
 
 /// What every method of this objective reports, beside its gradients' norms: means over the optimiser steps of an
 /// update, and the value normaliser after it.
@@ -40,7 +41,6 @@ pub(crate) const fn measures<const N: usize, const ALL: usize>(norms: [Measure; 
 
 /// An actor-critic under training.
 pub struct PpoLearner<N> {
-    model: Arc<Model>,
     network: Arc<N>,
     config: UpdateConfig,
     ppo: Ppo<N>,
@@ -55,13 +55,12 @@ impl<N: ActorCritic> PpoLearner<N> {
     /// # Panics
     /// When `params` is not of the layout's length.
     pub fn new(
-        model: Arc<Model>,
         network: Arc<N>,
         config: UpdateConfig,
         params: Vec<f32>,
     ) -> Result<Self, ThreadPoolBuildError> {
         let ppo = Ppo::new(Arc::clone(&network), config, params)?;
-        Ok(Self { model, network, config, ppo })
+        Ok(Self { network, config, ppo })
     }
 
     /// The measures' values: means over optimiser steps.
@@ -84,8 +83,16 @@ impl<N: ActorCritic> PpoLearner<N> {
 }
 
 impl<N: ActorCritic> Learner for PpoLearner<N> {
-    fn model(&self) -> &Arc<Model> {
-        &self.model
+    fn regime(&self) -> Regime {
+        Regime::OnPolicy
+    }
+
+    fn layout(&self) -> &Layout {
+        self.network.layout()
+    }
+
+    fn acting(&self) -> Range<usize> {
+        self.network.acting()
     }
 
     fn measures(&self) -> &'static [Measure] {

@@ -2,16 +2,25 @@
 
 use super::{TdLearner, ValueNetwork};
 use crate::{
-    Learner, Model,
+    Learner, Regime,
     blocks::draw_pairing,
     learner::{Draw, Measure, NamedState, NotFinite, Place, StateError, restore},
 };
 use rit_episode::{Episode, Stream};
-use std::{slice, sync::Arc};
+use rit_nn::Layout;
+use std::{ops::Range, slice};
 
 impl<N: ValueNetwork> Learner for TdLearner<N> {
-    fn model(&self) -> &Arc<Model> {
-        &self.model
+    fn regime(&self) -> Regime {
+        Regime::Replay
+    }
+
+    fn layout(&self) -> &Layout {
+        &self.network.parts().layout
+    }
+
+    fn acting(&self) -> Range<usize> {
+        self.network.parts().acting.clone()
     }
 
     fn measures(&self) -> &'static [Measure] {

@@ -2,7 +2,7 @@
 
 use super::Mappo;
 use crate::{
-    methods::Actor,
+    networks::Actor,
     on_policy::{self, ActorCritic as _},
 };
 use rit_episode::{Policy, Turn};

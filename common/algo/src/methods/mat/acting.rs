@@ -6,7 +6,7 @@
 use super::{DecoderBlock, Mat, MultiHead, Projected, normalized_sum};
 use crate::{
     Rows,
-    methods::Actor,
+    networks::Actor,
     on_policy::{self, ActorCritic as _, Inputs},
 };
 use rit_episode::{Policy, Turn};
