@@ -1,8 +1,8 @@
 //! What can be wrong with a configuration, in words.
 
-use crate::{keys::quoted, resolve::LIVE};
+use crate::{keys::quoted, resolve::LIVE, saved::FORMAT_VERSION};
 use rit_algo::Method;
-use rit_env::{TaskError, TaskSet, UnknownName};
+use rit_env::{SpecError, TaskError, TaskSet, UnknownName};
 
 /// What is wrong with what was typed. Every message is one line, names the key, and says what would do.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -20,7 +20,9 @@ pub enum ConfigError {
         reason: String,
     },
     /// A run's file of another build.
-    #[error("config.toml has format_version {found}, this build reads 1; go on with the build that wrote it")]
+    #[error(
+        "config.toml has format_version {found}, this build reads {FORMAT_VERSION}; go on with the build that wrote it"
+    )]
     Format {
         /// Its version.
         found: String,
@@ -108,13 +110,15 @@ pub enum ConfigError {
         /// What is wrong with the name.
         error: TaskError,
     },
-    /// A task that is listed twice.
-    #[error("{key} lists {name} twice")]
+    /// A task that is listed twice, under one name or two.
+    #[error("{key} lists one task twice, as {first} and as {second}; leave one out")]
     TaskTwice {
         /// The key.
         key: &'static str,
-        /// The task.
-        name: String,
+        /// What it is called first.
+        first: String,
+        /// What it is called then.
+        second: String,
     },
     /// Environments in Python and a task set of ours.
     #[error(
@@ -144,13 +148,15 @@ pub enum ConfigError {
         task: String,
     },
     /// Sizes that make no task.
-    #[error("environment.worlds: {task} needs at least one agent, as many entities as agents, and a feature")]
+    #[error("environment.worlds: task {task}: {error}")]
     WorldSizes {
         /// The task, in quotes.
         task: String,
+        /// What is wrong with them.
+        error: SpecError,
     },
     /// Sizes beyond what an episode can have.
-    #[error("environment.worlds: {0}")]
+    #[error("the sizes that hold every training and testing task: {0}; name other tasks")]
     Dims(#[from] rit_episode::DimsError),
     /// A key of environments in Python.
     #[error("{key} means nothing without environment.python; leave it out")]
@@ -199,8 +205,8 @@ pub enum ConfigError {
         /// What was typed.
         policy_lag: usize,
     },
-    /// A word that is none of a key's choices.
-    #[error("{key} = {found} is none of its choices: {choices}")]
+    /// A word that is not one of a key's choices.
+    #[error("{key} = {found} is not one of: {choices}")]
     Choice {
         /// The key.
         key: String,

@@ -40,7 +40,7 @@ pub fn python_asked(
     let Some(Value::Table(typed)) = typed.remove("environment") else { return Ok(None) };
     let mut defaults = resolve::defaults()?;
     let typed = Table::from_iter([("environment".to_owned(), Value::Table(typed))]);
-    keys::check(&typed, &defaults)?;
+    keys::check(&typed, &defaults, &defaults)?;
     let mut typed = typed;
     choose(&mut typed)?;
     resolve::merge(&mut defaults, typed);
@@ -126,9 +126,7 @@ pub(crate) fn task_set(environment: &Environment) -> Result<TaskSet, ConfigError
                 has_scenes: false,
                 is_reproducible: world.is_reproducible,
             };
-            if spec.n_agents == 0 || spec.n_entities < spec.n_agents || spec.feature_dim == 0 {
-                return Err(ConfigError::WorldSizes { task: keys::quoted(name) });
-            }
+            spec.check().map_err(|error| ConfigError::WorldSizes { task: keys::quoted(name), error })?;
             Ok(ForeignTask { name: name.clone(), spec, maker: None })
         };
         names.iter().map(task).collect::<Result<Vec<_>, ConfigError>>()
@@ -195,6 +193,48 @@ mod tests {
         let text = config.to_toml().unwrap();
         assert_eq!(resolve(&text, "config.toml", &[]), Ok(config));
         assert_eq!(python_asked(&text, "config.toml", &[]), Ok(None), "it says all already");
+    }
+
+    /// No run begins with a task in which nothing can be decided, however its file came about.
+    #[test]
+    fn sizes_that_make_no_task_are_refused() {
+        let world = |change: &dyn Fn(&mut World)| {
+            let mut world = World {
+                task: "two".to_owned(),
+                n_agents: 2,
+                n_entities: 4,
+                steps_max: 25,
+                has_wins: false,
+                is_reproducible: true,
+            };
+            change(&mut world);
+            world
+        };
+        let resolved = |world: World, features: &[&str], actions: &[&str]| {
+            let names = |names: &[&str]| names.iter().map(|&name| name.to_owned()).collect::<Vec<_>>();
+            let answered = python_answered(&[world], &names(features), &names(actions)).unwrap();
+            let only = set("environment.testing_tasks=[]").unwrap();
+            resolve(MINE, "my.toml", &[answered, only]).map_err(|error| error.to_string())
+        };
+        assert!(resolved(world(&|_| {}), &["x"], &["stay"]).is_ok());
+        let refused =
+            |world, features: &[&str], actions: &[&str]| resolved(world, features, actions).unwrap_err();
+        for message in [
+            refused(world(&|world| world.n_agents = 0), &["x"], &["stay"]),
+            refused(world(&|world| world.n_entities = 1), &["x"], &["stay"]),
+            refused(world(&|world| world.steps_max = 0), &["x"], &["stay"]),
+            refused(world(&|_| {}), &[], &["stay"]),
+            refused(world(&|_| {}), &["x"], &[]),
+        ] {
+            assert!(message.starts_with("environment.worlds: task \"two\": "), "{message}");
+            assert!(message.contains("make no task; it needs at least one agent"), "{message}");
+        }
+        // What is too large is so over all tasks, and no fault of one key.
+        assert_eq!(
+            refused(world(&|world| world.n_entities = 300), &["x"], &["stay"]),
+            "the sizes that hold every training and testing task: entities_max = 300 is out of range 2..=255; name \
+             other tasks"
+        );
     }
 
     #[test]

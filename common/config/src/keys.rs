@@ -1,4 +1,4 @@
-//! The keys there are: what kind of value each takes, and which one somebody may have meant.
+//! The keys there are: what kind of value each takes, and which one a misspelt name may mean.
 
 use crate::{
     ConfigError,
@@ -15,20 +15,25 @@ const SHOWN_LEN_MAX: usize = 60;
 /// How alike a key must be to be suggested, from 0 to 1.
 const ALIKE: f64 = 0.8;
 
-/// Every typed key must be one of the defaults', and of its kind.
-pub fn check(typed: &Table, defaults: &Table) -> Result<(), ConfigError> {
-    check_section(typed, defaults, "", defaults)
+/// Every typed key must be one of the defaults', and of its kind. `listed` are those that a message may list.
+pub fn check(typed: &Table, defaults: &Table, listed: &Table) -> Result<(), ConfigError> {
+    check_section(typed, defaults, "", &|key| unknown(key, defaults, listed))
 }
 
-fn check_section(typed: &Table, section: &Table, prefix: &str, defaults: &Table) -> Result<(), ConfigError> {
+fn check_section(
+    typed: &Table,
+    section: &Table,
+    prefix: &str,
+    unknown: &dyn Fn(&str) -> ConfigError,
+) -> Result<(), ConfigError> {
     for (name, value) in typed {
         let key = format!("{prefix}{name}");
-        let default = section.get(name).ok_or_else(|| unknown(&key, defaults))?;
+        let default = section.get(name).ok_or_else(|| unknown(&key))?;
         let wrong =
             |found: String| ConfigError::Kind { key: key.clone(), expected: expected(default), found };
         match (value, default) {
             (Value::Table(value), Value::Table(default)) => {
-                check_section(value, default, &format!("{key}."), defaults)?;
+                check_section(value, default, &format!("{key}."), unknown)?;
             }
             // A whole number will do for a real one.
             (Value::Integer(_), Value::Float(_)) => {}
@@ -45,13 +50,13 @@ fn check_section(typed: &Table, section: &Table, prefix: &str, defaults: &Table)
     Ok(())
 }
 
-/// What `--set key=text` sets, as the key's kind reads the text.
+/// What `--set key=text` sets, as the key's kind reads the text. `listed` are the keys that a message may list.
 ///
 /// # Errors
 /// When there is no such key, or the text is of another kind.
-pub fn read(key: &str, text: &str, defaults: &Table) -> Result<Value, ConfigError> {
+pub fn read(key: &str, text: &str, defaults: &Table, listed: &Table) -> Result<Value, ConfigError> {
     let former = former(key);
-    let default = find(key, defaults).or(former.as_ref()).ok_or_else(|| unknown(key, defaults))?;
+    let default = find(key, defaults).or(former.as_ref()).ok_or_else(|| unknown(key, defaults, listed))?;
     let wrong = |found: String| {
         let key = key.to_owned();
         Err(ConfigError::Kind { key, expected: expected(default), found })
@@ -163,11 +168,11 @@ pub fn quoted(text: &str) -> String {
     format!("{shown:?}{}", if shown.len() < text.len() { "…" } else { "" })
 }
 
-fn unknown(key: &str, defaults: &Table) -> ConfigError {
+fn unknown(key: &str, defaults: &Table, listed: &Table) -> ConfigError {
     let advice = closest(key, defaults).map(|known| format!("did you mean {known}?"));
     let advice = advice.unwrap_or_else(|| match key.split_once('.') {
         Some((section, _)) if matches!(defaults.get(section), Some(Value::Table(_))) => {
-            format!("[{section}] has {}", names(defaults, section))
+            format!("[{section}] has {}", names(listed, section))
         }
         _ => {
             let sections: Vec<_> = defaults.keys().map(String::as_str).collect();

@@ -33,6 +33,6 @@ pub use number::{CountError, WHOLE_MAX, count};
 pub use owned_run_dir::OwnedRunDir;
 pub use program::{in_program_words, program_name, set_program_name};
 pub use regular_file::{TEXT_BYTES_MAX, open_regular, read_regular, read_tail, read_text, write_whole};
-pub use resolve::{all_keys, is_free, is_live, keys_like, resolve, set, set_live};
+pub use resolve::{all_keys, is_free, is_live, keys_like, resolve, set, set_all, set_live};
 pub use run_dir::{RunDir, RunDirError};
 pub use run_lock::RunLock;

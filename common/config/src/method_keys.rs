@@ -72,6 +72,22 @@ pub(crate) fn retain(config: &mut Table, method: Method) {
     }
 }
 
+/// The keys that a method has, of all that there are.
+pub(crate) fn of_method(all: &Table, method: Method) -> Table {
+    let mut own = all.clone();
+    retain(&mut own, method);
+    own
+}
+
+/// The method that the last of these `section.key=value` settings names that names one.
+pub(crate) fn assigned(assignments: &[String]) -> Option<Method> {
+    let name = |assignment: &String| {
+        let (key, name) = assignment.split_once('=')?;
+        (key.trim() == "algorithm.name").then(|| name.trim().trim_matches('"').parse().ok())?
+    };
+    assignments.iter().rev().find_map(name)
+}
+
 /// What a method sets differently from the defaults and the task set's preset. At the top for all task sets, and in
 /// sections of a family's name for its task sets. Most methods need none: the paper's settings are one table for all.
 fn preset(method: Method) -> &'static str {
@@ -238,7 +254,7 @@ pub(crate) mod by_name {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Config, OptimizerName, resolve, set};
+    use crate::{Config, OptimizerName, resolve, set, set_all};
     use rit_env::rollout::TimeLimit;
 
     fn with(task_set: &str, settings: &[&str]) -> Result<Config, ConfigError> {
@@ -350,6 +366,42 @@ mod tests {
             lag,
             "algorithm.policy_lag = 1: mat learns from each batch with the weights that rolled it; only 0 will do"
         );
+    }
+
+    /// An unknown key's message says what is possible, and no key that the method would refuse.
+    #[test]
+    fn keys_of_other_methods_are_not_listed() {
+        let assignments = ["algorithm.name=mappo", "algorithm.lambda=0.3", "algorithm.name=\"vdn-attn\""];
+        let message = set_all(&assignments.map(str::to_owned)).unwrap_err().to_string();
+        let possible =
+            "unknown key \"algorithm.lambda\"; [algorithm] has batch_size, buffer_size, encoder, epsilon_";
+        assert!(message.starts_with(possible), "{message}");
+        let others = [" clip,", "imagined_weight", "role_kl_weight", "gae_lambda"];
+        assert!(others.iter().all(|key| !message.contains(key)), "{message}");
+        // Without a method, the keys of all methods are listed.
+        let message = set("algorithm.lambda=0.3").unwrap_err().to_string();
+        assert!(message.contains("imagined_weight") && message.contains("gae_lambda"), "{message}");
+        // And in a file of a person's own.
+        let file = "environment.task_set = 'matrix-game'\nalgorithm.name = 'mappo'\nalgorithm.lambda = 0.3";
+        let message = resolve(file, "test", &[]).unwrap_err().to_string();
+        assert!(message.contains("gae_lambda") && !message.contains("buffer_size"), "{message}");
+    }
+
+    /// A size that a method's networks have can be set, and no other.
+    #[test]
+    fn a_method_has_the_keys_of_its_networks_sizes() {
+        for method in Method::ALL {
+            let config = with("cooperative-navigation", &[&format!("algorithm.name={method}")]).unwrap();
+            let sizes: Vec<&str> = config.model().sizes().into_iter().map(|(name, _)| name).collect();
+            let defaults = parse(include_str!("presets/all.toml"), "all").unwrap();
+            let names = defaults["network"].as_table().unwrap().keys();
+            // A file, and a bound of ROMA's roles: no sizes.
+            let no_sizes = ["initial_weights", "role_variance_floor"];
+            for name in names.filter(|name| !no_sizes.contains(&name.as_str())) {
+                let key = format!("network.{name}");
+                assert_eq!(has(method, &key), sizes.contains(&name.as_str()), "{method}: {key}");
+            }
+        }
     }
 
     /// Presets of methods may say nothing that the method has not, and for no family that there is not.

@@ -4,7 +4,7 @@
 
 use std::{borrow::Cow, sync::OnceLock};
 
-/// Its name where nobody has given another.
+/// Its name if no other was given.
 const RIT: &str = "rit";
 
 static NAME: OnceLock<String> = OnceLock::new();
@@ -48,6 +48,6 @@ mod tests {
             "no learner runs for runs/rit-1; `corridor train --resume x` goes on, `corridor ctl` asks; rit-vdn is an \
              algorithm"
         );
-        assert_eq!(program_name(), "rit", "nobody has given another");
+        assert_eq!(program_name(), "rit", "no other name was given");
     }
 }

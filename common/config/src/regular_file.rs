@@ -76,22 +76,61 @@ pub fn read_tail(path: &Path, begins_at: u64, bytes_max: u64) -> io::Result<Stri
     Ok(String::from_utf8_lossy(&bytes).into_owned())
 }
 
-/// Writes a file for its user alone, as a whole or not at all.
+/// Writes a file for its user alone, as a whole or not at all, whatever happens to the process or to the machine's power.
 ///
 /// # Errors
 /// When the system refuses, or a folder lies where it is prepared (`NAME.partial`).
 pub fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    write_synced(path, bytes, File::sync_all)
+}
+
+/// As [`write_whole`]; `sync` waits until what it is given is on the disk.
+fn write_synced(path: &Path, bytes: &[u8], sync: impl Fn(&File) -> io::Result<()>) -> io::Result<()> {
     let partial = path.with_extension("partial");
     // Whatever a process that was killed has left there.
     let _ = fs::remove_file(&partial);
     let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&partial)?;
-    file.write_all(bytes).and_then(|()| fs::rename(&partial, path))
+    file.write_all(bytes)?;
+    // A name may reach the disk before the bytes behind it do: after a power cut an empty file would lie there.
+    sync(&file)?;
+    fs::rename(&partial, path)?;
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    // The new name. Not every file system can wait for a folder, and without it the old file, or the new one, is there.
+    let _ = File::open(folder).and_then(|folder| sync(&folder));
+    Ok(())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use rustix::fs::Mode;
+    use std::cell::RefCell;
+
+    #[test]
+    fn bytes_are_on_the_disk_before_the_name_is_theirs() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("file");
+        write_whole(&path, b"old").unwrap();
+        let synced = RefCell::new(Vec::new());
+        write_synced(&path, b"new bytes", |file| {
+            let metadata = file.metadata()?;
+            synced.borrow_mut().push((metadata.is_dir(), metadata.len() == 9, read_text(&path)?));
+            Ok(())
+        })
+        .unwrap();
+        let synced = synced.into_inner();
+        assert_eq!(synced.len(), 2, "the file, then the folder");
+        assert_eq!(synced[0], (false, true, "old".to_owned()));
+        assert!(synced[1].0 && synced[1].2 == "new bytes", "{synced:?}");
+        // Bytes that do not reach the disk replace nothing; a folder that cannot be synced is no error.
+        let refused = || io::Error::other("the disk is gone");
+        assert!(write_synced(&path, b"newer", |_| Err(refused())).is_err());
+        assert_eq!(read_text(&path).unwrap(), "new bytes");
+        let folders_cannot =
+            |file: &File| if file.metadata()?.is_dir() { Err(refused()) } else { file.sync_all() };
+        write_synced(&path, b"newest", folders_cannot).unwrap();
+        assert_eq!(read_text(&path).unwrap(), "newest");
+    }
 
     #[test]
     fn of_a_log_only_the_end_is_read() {

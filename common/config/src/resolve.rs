@@ -9,7 +9,7 @@ use rit_env::{
     Physics, TaskSet,
     combat::{StatsVersion, world::ScriptedMedivac},
 };
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use toml::{Table, Value};
 
 /// Every key with its default.
@@ -31,7 +31,9 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
     method_keys::translate_ablations(&mut set, method_keys::named(&typed)?)?;
     method_keys::translate_time_limit(&mut set)?;
     merge(&mut typed, set);
-    keys::check(&typed, &defaults)?;
+    // Whatever is wrong with the name is said once the keys are right.
+    let listed = method_keys::named(&typed).map(|method| method_keys::of_method(&defaults, method));
+    keys::check(&typed, &defaults, listed.as_ref().unwrap_or(&defaults))?;
     foreign::choose(&mut typed)?;
     let (method, task_set) = (method_keys::named(&typed)?, task_set(&typed)?);
     method_keys::check(&typed, method)?;
@@ -47,10 +49,22 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
     for (key, value, min, max) in config.limits() {
         value.check(key, min, max)?;
     }
+    check_keys_together(&config)?;
+    check_tasks(&config)?;
+    // Unknown tasks have no sizes.
+    config.dims().validate()?;
+    check_backend(&config)?;
+    check_meaning(&config)?;
+    config.model().validate()?;
+    Ok(config)
+}
+
+/// Values that are sound each by itself, and cannot go together.
+fn check_keys_together(config: &Config) -> Result<(), ConfigError> {
+    let (method, task_set) = (config.algorithm.name, config.environment.task_set);
     if method.facts().regime == Regime::OnPolicy && config.algorithm.policy_lag > 0 {
         return Err(ConfigError::OnPolicyLag { method, policy_lag: config.algorithm.policy_lag });
     }
-    let task_set = config.environment.task_set;
     if matches!(config.training.until, Until::WinRate(_)) && !task_set.has_wins() {
         return Err(ConfigError::NoWins { until: config.training.until.into(), task_set });
     }
@@ -66,38 +80,52 @@ pub fn resolve(experiment: &str, source_name: &str, settings: &[Table]) -> Resul
                 .to_owned(),
         ));
     }
-    let Environment { training_tasks, testing_tasks, spawn_rotate, stats, enemy_medivac, .. } =
-        &config.environment;
+    Ok(())
+}
+
+/// Whether every name is that of a task, and no list has a task twice, under one name or two: `3m-vs-3m` is `3m`.
+fn check_tasks(config: &Config) -> Result<(), ConfigError> {
+    let Environment { task_set, training_tasks, testing_tasks, .. } = &config.environment;
     for (key, names) in
         [("environment.training_tasks", training_tasks), ("environment.testing_tasks", testing_tasks)]
     {
-        for (at, name) in names.iter().enumerate() {
-            task_set.task(name).map_err(|error| ConfigError::Task { key, error })?;
-            if names[..at].contains(name) {
-                return Err(ConfigError::TaskTwice { key, name: name.clone() });
+        let mut listed = HashMap::new();
+        for name in names {
+            let task = task_set.task(name).map_err(|error| ConfigError::Task { key, error })?;
+            if let Some(first) = listed.insert(task, name) {
+                let (first, second) = (first.clone(), name.clone());
+                return Err(ConfigError::TaskTwice { key, first, second });
             }
         }
     }
-    // Unknown tasks have no sizes.
-    config.dims().validate()?;
-    check_backend(&config)?;
+    Ok(())
+}
+
+/// Whether every key of `[environment]` that is set means something to the task set.
+fn check_meaning(config: &Config) -> Result<(), ConfigError> {
+    let Environment {
+        task_set,
+        spawn_rotate,
+        stats,
+        enemy_medivac,
+        approach_shaping,
+        physics,
+        view_radius,
+        ..
+    } = config.environment;
     let is_combat = matches!(task_set, TaskSet::Combat(_));
     let meaningless = [
-        ("environment.spawn_rotate", *spawn_rotate != SpawnRotate::Published && !is_combat),
-        ("environment.stats", *stats != StatsVersion::default() && !is_combat),
-        ("environment.enemy_medivac", *enemy_medivac != ScriptedMedivac::default() && !is_combat),
-        ("environment.approach_shaping", config.environment.approach_shaping != 0.0 && !task_set.has_prey()),
-        ("environment.physics", config.environment.physics != Physics::default() && !task_set.has_physics()),
-        (
-            "environment.view_radius",
-            config.environment.view_radius.is_finite() && !task_set.has_view_radius(),
-        ),
+        ("environment.spawn_rotate", spawn_rotate != SpawnRotate::Published && !is_combat),
+        ("environment.stats", stats != StatsVersion::default() && !is_combat),
+        ("environment.enemy_medivac", enemy_medivac != ScriptedMedivac::default() && !is_combat),
+        ("environment.approach_shaping", approach_shaping != 0.0 && !task_set.has_prey()),
+        ("environment.physics", physics != Physics::default() && !task_set.has_physics()),
+        ("environment.view_radius", view_radius.is_finite() && !task_set.has_view_radius()),
     ];
-    if let Some(&(key, _)) = meaningless.iter().find(|(_, meaningless)| *meaningless) {
-        return Err(ConfigError::Meaningless { key, task_set });
+    match meaningless.into_iter().find(|(_, meaningless)| *meaningless) {
+        Some((key, _)) => Err(ConfigError::Meaningless { key, task_set }),
+        None => Ok(()),
     }
-    config.model().validate()?;
-    Ok(config)
 }
 
 /// `[starcraft]` with its defaults.
@@ -143,13 +171,29 @@ fn check_backend(config: &Config) -> Result<(), ConfigError> {
 /// # Errors
 /// When there is no `=`, no such key, or the value is of another kind.
 pub fn set(assignment: &str) -> Result<Table, ConfigError> {
+    let defaults = defaults()?;
+    set_listing(assignment, &defaults, &defaults)
+}
+
+/// All of a command line's. Where one of them names the method, no message lists a key that it has not.
+///
+/// # Errors
+/// As [`set`].
+pub fn set_all(assignments: &[String]) -> Result<Vec<Table>, ConfigError> {
+    let defaults = defaults()?;
+    let method = method_keys::assigned(assignments);
+    let listed = method.map_or_else(|| defaults.clone(), |method| method_keys::of_method(&defaults, method));
+    assignments.iter().map(|assignment| set_listing(assignment, &defaults, &listed)).collect()
+}
+
+fn set_listing(assignment: &str, defaults: &Table, listed: &Table) -> Result<Table, ConfigError> {
     let no_assignment = || ConfigError::NoAssignment(keys::quoted(assignment));
     let (key, text) = assignment.split_once('=').ok_or_else(no_assignment)?;
     let (key, text) = (key.trim(), text.trim());
     if key.is_empty() {
         return Err(no_assignment());
     }
-    let value = keys::read(key, text, &defaults()?)?;
+    let value = keys::read(key, text, defaults, listed)?;
     let (sections, name) = key.rsplit_once('.').unwrap_or(("", key));
     let table = Table::from_iter([(name.to_owned(), value)]);
     let sections = sections.rsplit('.').filter(|section| !section.is_empty());

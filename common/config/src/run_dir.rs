@@ -36,7 +36,7 @@ pub enum RunDirError {
     /// It would be written over.
     #[error("{0} already holds a run; choose another --run-dir, or move it away")]
     Occupied(PathBuf),
-    /// Somebody else's things would lie among the run's.
+    /// The folder holds files that are not the run's.
     #[error("{root} is not empty, {entry} lies there; choose another --run-dir, or an empty one")]
     NotEmpty {
         /// The directory.

@@ -11,7 +11,7 @@ use std::collections::BTreeSet;
 use toml::{Table, Value};
 
 /// What this build writes. Raise it when what a key means changes.
-const FORMAT_VERSION: i64 = 1;
+pub(crate) const FORMAT_VERSION: i64 = 1;
 
 /// Keys that have been added since, and what builds did that did not know them: no guess, whatever a preset says today.
 pub(crate) const KNOWN_SINCE: [(&str, &str); 4] = [
@@ -24,7 +24,7 @@ pub(crate) const KNOWN_SINCE: [(&str, &str); 4] = [
 /// Its key, the first of the file.
 const KEY: &str = "format_version";
 
-/// A run's configuration, and what somebody should know of how it was found.
+/// A run's configuration, and warnings of how it was found.
 #[derive(Debug)]
 pub(crate) struct Saved {
     pub(crate) config: Config,
@@ -138,10 +138,15 @@ mod tests {
         let of = |settings: &[Table]| resolve_saved(&older, settings).unwrap().config.algorithm.time_limit;
         assert_eq!(of(&[]), TimeLimit::Environment);
         assert_eq!(of(&[set("algorithm.time_limit=truncated").unwrap()]), TimeLimit::Truncated);
-        let newer = text.replacen("format_version = 1", "format_version = 2", 1);
+        let next = FORMAT_VERSION + 1;
+        let [this, newer] = [FORMAT_VERSION, next].map(|version| format!("format_version = {version}"));
+        let newer = text.replacen(&this, &newer, 1);
         assert_eq!(
             error(&newer),
-            "config.toml has format_version 2, this build reads 1; go on with the build that wrote it"
+            format!(
+                "config.toml has format_version {next}, this build reads {FORMAT_VERSION}; go on with the build that \
+                 wrote it"
+            )
         );
         assert!(error("seed = = 3").contains("line 1"));
     }

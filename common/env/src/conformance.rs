@@ -35,7 +35,7 @@ fn roll(environment: &mut dyn Environment, episode: u64) -> Vec<(Observation, Op
     let exploration = &mut seed.stream(Stream::Exploration, episode);
     let spec = environment.spec();
     let Spec { n_agents: n, n_entities: m, feature_dim: features, n_actions, .. } = spec;
-    assert!(n >= 1 && m >= n && features >= 1 && n_actions >= 1, "there is something to decide");
+    assert_eq!(spec.check(), Ok(()), "there is something to decide");
 
     environment.begin_reset(rng).expect("an episode begins");
     environment.reset(rng).expect("an episode begins");

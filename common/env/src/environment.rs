@@ -38,10 +38,72 @@ pub struct Spec {
     pub is_reproducible: bool,
 }
 
+/// Sizes that make no task.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "{n_agents} agents, {n_entities} entities (agents included), {feature_dim} features, {n_actions} actions and \
+     {steps_max} steps make no task; it needs at least one agent, as many entities as agents, a feature, an action and \
+     a step"
+)]
+pub struct SpecError {
+    /// Number of agents.
+    pub n_agents: usize,
+    /// Number of entities, agents included.
+    pub n_entities: usize,
+    /// Features of one entity.
+    pub feature_dim: usize,
+    /// Size of the action space.
+    pub n_actions: usize,
+    /// Most steps of an episode.
+    pub steps_max: usize,
+}
+
 impl Spec {
     /// Features of one entity with its last action: d.
     pub fn entity_dim(&self) -> usize {
         self.feature_dim + self.n_actions
+    }
+
+    /// Checks that there is something to decide, and a step to decide it in. Every task that comes from outside is held
+    /// to this.
+    ///
+    /// # Errors
+    /// When no task has such sizes.
+    pub fn check(&self) -> Result<(), SpecError> {
+        let Self { n_agents, n_entities, feature_dim, n_actions, steps_max, .. } = *self;
+        if n_agents == 0 || n_entities < n_agents || feature_dim == 0 || n_actions == 0 || steps_max == 0 {
+            return Err(SpecError { n_agents, n_entities, feature_dim, n_actions, steps_max });
+        }
+        Ok(())
+    }
+
+    /// The first fact in which two tasks differ: its name, what it is here, and what it is there.
+    pub(crate) fn first_difference(&self, other: &Self) -> Option<(&'static str, String, String)> {
+        let differing = self.facts().into_iter().zip(other.facts()).find(|(here, there)| here != there);
+        differing.map(|((name, here), (_, there))| (name, here, there))
+    }
+
+    fn facts(&self) -> [(&'static str, String); 8] {
+        let Self {
+            n_agents,
+            n_entities,
+            feature_dim,
+            n_actions,
+            steps_max,
+            has_wins,
+            has_scenes,
+            is_reproducible,
+        } = self;
+        [
+            ("n_agents", n_agents.to_string()),
+            ("n_entities", n_entities.to_string()),
+            ("feature_dim", feature_dim.to_string()),
+            ("n_actions", n_actions.to_string()),
+            ("steps_max", steps_max.to_string()),
+            ("has_wins", has_wins.to_string()),
+            ("has_scenes", has_scenes.to_string()),
+            ("is_reproducible", is_reproducible.to_string()),
+        ]
     }
 }
 
@@ -231,8 +293,52 @@ pub trait Environment: Send {
     /// When the environment cannot go on.
     fn step(&mut self, actions: &[Action], rng: &mut Rng) -> Result<Step, EnvironmentError>;
 
+    /// Whether this world says [`End::Terminated`] where nothing but time has ended the episode. Only then may
+    /// [`TimeLimit::Truncated`](crate::rollout::TimeLimit::Truncated) make a cut of such an end on the last step, unless
+    /// the team has won. A world that says [`End::Truncated`] where time is up, or whose task itself ends on its last
+    /// step, leaves this as it is. Constant.
+    fn is_over_at_limit(&self) -> bool {
+        false
+    }
+
     /// What can be drawn of the state, where the entities have places.
     fn scene(&self) -> Option<Scene> {
         None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::matrix_game::MatrixGame;
+
+    #[test]
+    fn sizes_that_make_no_task_are_refused() {
+        let good = MatrixGame::SPEC;
+        assert_eq!(good.check(), Ok(()));
+        for wrong in [
+            Spec { n_agents: 0, ..good },
+            Spec { n_entities: 1, ..good },
+            Spec { feature_dim: 0, ..good },
+            Spec { n_actions: 0, ..good },
+            Spec { steps_max: 0, ..good },
+        ] {
+            assert!(wrong.check().is_err(), "{wrong:?}");
+        }
+        assert_eq!(
+            Spec { steps_max: 0, ..good }.check().unwrap_err().to_string(),
+            "2 agents, 2 entities (agents included), 3 features, 3 actions and 0 steps make no task; it needs at least \
+             one agent, as many entities as agents, a feature, an action and a step"
+        );
+    }
+
+    #[test]
+    fn specs_differ_by_name() {
+        let spec = MatrixGame::SPEC;
+        assert_eq!(spec.first_difference(&spec), None);
+        let other = Spec { steps_max: 7, has_wins: false, ..spec };
+        assert_eq!(other.first_difference(&spec), Some(("steps_max", "7".into(), "2".into())));
+        let other = Spec { is_reproducible: false, ..spec };
+        assert_eq!(other.first_difference(&spec), Some(("is_reproducible", "false".into(), "true".into())));
     }
 }

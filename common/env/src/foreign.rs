@@ -71,18 +71,20 @@ impl ForeignSet {
         }
     }
 
-    /// A task that no list of a set in this process names, if its maker knows it. As [`Self::kept`], each takes memory once.
-    pub(crate) fn unlisted(&self, name: &str) -> Option<&'static ForeignTask> {
+    /// A task that no list of a set in this process names, if its maker knows it; or what is wrong with its world. As
+    /// [`Self::kept`], each takes memory once.
+    pub(crate) fn unlisted(&self, name: &str) -> Result<Option<&'static ForeignTask>, String> {
         static KEPT: Mutex<Vec<&'static ForeignTask>> = Mutex::new(Vec::new());
-        let maker = self.maker?;
+        let Some(maker) = self.maker else { return Ok(None) };
         let mut kept = KEPT.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(known) = kept.iter().find(|known| known.name == name && known.maker == Some(maker)) {
-            return Some(known);
+            return Ok(Some(known));
         }
         let sizes = [self.feature_names.len(), self.action_names.len()];
-        let new: &'static ForeignTask = Box::leak(Box::new(own::described(maker, name, sizes).ok()??));
+        let Some(described) = own::described(maker, name, sizes)? else { return Ok(None) };
+        let new: &'static ForeignTask = Box::leak(Box::new(described));
         kept.push(new);
-        Some(new)
+        Ok(Some(new))
     }
 }
 
@@ -93,7 +95,7 @@ impl ForeignTask {
             let detail = format!("the world of {} is not one of this program's own", self.name);
             EnvironmentError::new(FailureKind::Raised, detail)
         };
-        let made = self.maker.ok_or_else(elsewhere).and_then(|maker| Held::make(maker, &self.name));
+        let made = self.maker.ok_or_else(elsewhere).and_then(|maker| Held::make(maker, self));
         match made {
             Ok(world) => Box::new(world),
             Err(error) => Box::new(Nowhere(self.spec, error)),

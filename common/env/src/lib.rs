@@ -25,7 +25,7 @@ mod unknown_name;
 
 pub use environment::{
     BodyKind, Environment, EnvironmentError, EnvironmentOptions, FailureKind, LinkKind, Physics, Scene,
-    SceneBody, SceneLink, SceneUnit, Spec, Step,
+    SceneBody, SceneLink, SceneUnit, Spec, SpecError, Step,
 };
 pub use factory::{Embedded, EnvironmentFactory};
 pub use foreign::{ForeignSet, ForeignTask};

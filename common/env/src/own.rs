@@ -153,18 +153,14 @@ pub(crate) fn described(maker: Maker, task: &str, sizes: [usize; 2]) -> Result<O
     let made =
         catch_unwind(|| (maker.make)(task).map(|world| world.spec())).map_err(|panic| words(&*panic))?;
     let Some(spec) = made else { return Ok(None) };
-    let Spec { n_agents, n_entities, feature_dim, n_actions, steps_max, .. } = spec;
+    let Spec { feature_dim, n_actions, .. } = spec;
     if [feature_dim, n_actions] != sizes {
         return Err(format!(
             "its world has {feature_dim} features and {n_actions} actions, and the set names {} and {}",
             sizes[0], sizes[1]
         ));
     }
-    if n_agents == 0 || n_entities < n_agents || feature_dim == 0 || n_actions == 0 || steps_max == 0 {
-        return Err(
-            "its world needs an agent, a feature, an action and a step, and agents are entities".into()
-        );
-    }
+    spec.check().map_err(|error| error.to_string())?;
     Ok(Some(ForeignTask { name: task.to_owned(), spec, maker: Some(maker) }))
 }
 
@@ -172,16 +168,30 @@ pub(crate) fn described(maker: Maker, task: &str, sizes: [usize; 2]) -> Result<O
 pub(crate) struct Held {
     world: Box<dyn Environment>,
     spec: Spec,
+    is_over_at_limit: bool,
     seen: Observation,
     steps: usize,
 }
 
 impl Held {
-    /// The world of this task.
-    pub(crate) fn make(maker: Maker, task: &str) -> Result<Self, EnvironmentError> {
-        let world = held(|| Ok((maker.make)(task)))?;
-        let world = world.ok_or_else(|| bad(format!("the maker no longer makes the task {task:?}, which it has made before")))?;
-        Ok(Self { spec: world.spec(), world, seen: Observation::default(), steps: 0 })
+    /// The world of this task, which is still what it was when the run learned of it: buffers, networks and other hosts
+    /// count on that.
+    pub(crate) fn make(maker: Maker, task: &ForeignTask) -> Result<Self, EnvironmentError> {
+        let ForeignTask { name, spec: promised, .. } = task;
+        let made = held(|| {
+            let made = (maker.make)(name);
+            Ok(made.map(|world| (world.spec(), world.is_over_at_limit(), world)))
+        })?;
+        let (spec, is_over_at_limit, world) = made.ok_or_else(|| {
+            bad(format!("the maker no longer makes the task {name:?}, which it has made before"))
+        })?;
+        if let Some((fact, now, before)) = spec.first_difference(promised) {
+            return Err(bad(format!(
+                "the world of {name:?} has {fact} = {now} now, and had {before} when its set was registered; a task's \
+                 world is always the same"
+            )));
+        }
+        Ok(Self { spec, is_over_at_limit, world, seen: Observation::default(), steps: 0 })
     }
 
     /// Checks the state before it is shown.
@@ -236,8 +246,13 @@ impl Environment for Held {
         Ok(step)
     }
 
+    fn is_over_at_limit(&self) -> bool {
+        self.is_over_at_limit
+    }
+
     fn scene(&self) -> Option<Scene> {
-        self.world.scene()
+        // A drawing has no place for an error: a world that panics is not drawn.
+        catch_unwind(AssertUnwindSafe(|| self.world.scene())).ok().flatten()
     }
 }
 
@@ -268,7 +283,8 @@ mod tests {
 
     impl Environment for Breaks {
         fn spec(&self) -> Spec {
-            MatrixGame::SPEC
+            assert!(self.0 != "spec", "the rules are lost");
+            if self.0 == "sizes" { Spec { n_entities: 5, ..MatrixGame::SPEC } } else { MatrixGame::SPEC }
         }
 
         fn reset(&mut self, _: &mut Rng) -> Result<(), EnvironmentError> {
@@ -290,10 +306,23 @@ mod tests {
             let end = (self.0 != "endless").then_some(End::Terminated);
             Ok(Step { reward, shaping: 0.0, end, won: false })
         }
+
+        fn is_over_at_limit(&self) -> bool {
+            assert!(self.0 != "limit", "the clock is lost");
+            self.0 == "timed"
+        }
+
+        fn scene(&self) -> Option<Scene> {
+            assert!(self.0 != "scene", "the canvas is torn");
+            Some(Scene { bodies: vec![], links: vec![] })
+        }
     }
 
     fn make(task: &str) -> Option<Box<dyn Environment>> {
-        const KINDS: [&str; 6] = ["none", "panic", "feature", "mask", "reward", "endless"];
+        const KINDS: [&str; 11] = [
+            "none", "panic", "feature", "mask", "reward", "endless", "spec", "sizes", "limit", "timed",
+            "scene",
+        ];
         KINDS.into_iter().find(|kind| *kind == task).map(|kind| Box::new(Breaks(kind)) as _)
     }
 
@@ -317,6 +346,11 @@ mod tests {
         assert_eq!(set.task("endless"), set.task("endless"));
         assert!(set.task("other").unwrap_err().to_string().starts_with("unknown task \"other\""));
         assert_eq!(set.feature_names(), ["a", "b", "c"]);
+        // A task whose world is wrong is no unknown one: what is wrong is said.
+        assert_eq!(
+            set.task("spec").unwrap_err().to_string(),
+            "task \"spec\" of breaking: it panicked: the rules are lost"
+        );
         assert_eq!(register(&SET), Err(OwnTaskSetError::Name("breaking")), "and only once");
     }
 
@@ -343,17 +377,50 @@ mod tests {
             refused(OwnTaskSet { action_names: &["x"], ..SET }),
             "task \"none\" of wrong: its world has 3 features and 3 actions, and the set names 3 and 1"
         );
+        assert_eq!(
+            refused(OwnTaskSet { feature_names: &[], make: |_| Some(Box::new(Blind)), ..SET }),
+            "task \"none\" of wrong: 2 agents, 2 entities (agents included), 0 features, 3 actions and 2 steps make no \
+             task; it needs at least one agent, as many entities as agents, a feature, an action and a step"
+        );
+    }
+
+    /// A world without a feature.
+    struct Blind;
+
+    impl Environment for Blind {
+        fn spec(&self) -> Spec {
+            Spec { feature_dim: 0, ..MatrixGame::SPEC }
+        }
+
+        fn reset(&mut self, _: &mut Rng) -> Result<(), EnvironmentError> {
+            Ok(())
+        }
+
+        fn observe(&self, _: &mut Observation) {}
+
+        fn step(&mut self, _: &[Action], _: &mut Rng) -> Result<Step, EnvironmentError> {
+            Ok(Step { reward: 0.0, shaping: 0.0, end: None, won: false })
+        }
+    }
+
+    fn world(task: &str) -> Box<dyn Environment> {
+        let maker = Some(Maker { set: "breaking", make });
+        let task = ForeignTask { name: task.to_owned(), spec: MatrixGame::SPEC, maker };
+        Task::Foreign(Box::leak(Box::new(task))).environment(EnvironmentOptions::default())
+    }
+
+    #[test]
+    fn a_scene_that_panics_is_not_drawn_and_the_limit_is_passed_on() {
+        assert_eq!(world("scene").scene(), None);
+        assert!(world("none").scene().is_some());
+        assert!(world("timed").is_over_at_limit() && !world("none").is_over_at_limit());
     }
 
     #[test]
     fn a_broken_promise_costs_an_episode_and_is_named() {
         let rng = &mut RunSeed(1).stream(Stream::Environment, 0);
         let mut course = |task: &str| {
-            let spec = MatrixGame::SPEC;
-            let maker = Some(Maker { set: "breaking", make });
-            let task = ForeignTask { name: task.to_owned(), spec, maker };
-            let mut world =
-                Task::Foreign(Box::leak(Box::new(task))).environment(EnvironmentOptions::default());
+            let mut world = world(task);
             world.reset(rng).and_then(|()| world.step(&[0, 0], rng)).and_then(|_| world.step(&[0, 0], rng))
         };
         assert!(course("none").is_ok());
@@ -363,6 +430,13 @@ mod tests {
             ("mask", FailureKind::BadAnswer, "agent 0 has no available action"),
             ("reward", FailureKind::BadAnswer, "a step paid NaN and 0"),
             ("endless", FailureKind::BadAnswer, "the episode does not end within steps_max = 2"),
+            ("spec", FailureKind::Raised, "it panicked: the rules are lost"),
+            ("limit", FailureKind::Raised, "it panicked: the clock is lost"),
+            (
+                "sizes",
+                FailureKind::BadAnswer,
+                "the world of \"sizes\" has n_entities = 5 now, and had 2 when its set was registered;",
+            ),
         ] {
             let error = course(task).unwrap_err();
             assert!(error.kind == kind && error.detail.starts_with(words), "{task}: {error}");

@@ -43,7 +43,8 @@ pub enum TimeLimit {
     /// As its environment says.
     #[default]
     Environment,
-    /// Cut off, unless it is won: values go on beyond it. For methods whose values cannot tell how much time is left.
+    /// Cut off where time alone has ended it: values go on beyond it. What the task itself has ended on that step, such as
+    /// a battle that is won or lost, is over. For methods whose values cannot tell how much time is left.
     Truncated,
     /// Over: nothing is earned beyond it.
     Terminated,
@@ -90,6 +91,8 @@ struct Running {
     told: Result<(), EnvironmentError>,
     builder: EpisodeBuilder,
     time_limit: TimeLimit,
+    /// See [`Environment::is_over_at_limit`].
+    is_over_at_limit: bool,
     steps_max: usize,
     steps: usize,
 }
@@ -280,6 +283,7 @@ impl Rollout {
             number: job.number,
             task,
             time_limit: self.time_limit,
+            is_over_at_limit: world.environment().is_over_at_limit(),
             steps_max: world.spec().steps_max,
             steps: 0,
             world,
@@ -333,7 +337,8 @@ impl Running {
         self.steps += 1;
         let is_at_limit = self.steps >= self.steps_max;
         let end_of = |end| match self.time_limit {
-            TimeLimit::Truncated if is_at_limit && !step.won => End::Truncated,
+            // Of what is over on its last step, only a world that ends for want of time can be cut off there.
+            TimeLimit::Truncated if is_at_limit && self.is_over_at_limit && !step.won => End::Truncated,
             TimeLimit::Terminated if is_at_limit => End::Terminated,
             _ => end,
         };

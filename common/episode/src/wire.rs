@@ -189,9 +189,23 @@ pub fn encode(
     actor: u32,
     frame: &mut Frame,
 ) -> Result<(), EncodeError> {
-    let Dims { entity_dim: d, n_actions, agents_max, entities_max, steps_max } = layout.dims;
+    if !fits(episode, layout.dims) {
+        let Episode { n_agents, n_entities, .. } = *episode;
+        return Err(EncodeError { n_agents, n_entities, steps: episode.steps(), dims: layout.dims });
+    }
+    frame.payload.clear();
+    frame.payload.resize(layout.len, 0);
+    pad(episode, layout, &mut frame.payload);
+    frame.header = header_of(episode, layout, run_id, actor);
+    frame.header.checksum = checksum(&frame.header, &frame.payload);
+    Ok(())
+}
+
+/// Whether an episode is no larger than the dims, and its buffers are of its own sizes.
+fn fits(episode: &Episode, dims: Dims) -> bool {
+    let Dims { entity_dim: d, n_actions, agents_max, entities_max, steps_max } = dims;
     let (n, m, steps) = (episode.n_agents, episode.n_entities, episode.steps());
-    let fits = n >= 1
+    n >= 1
         && n <= agents_max
         && m >= n
         && m - n <= entities_max - agents_max
@@ -201,14 +215,13 @@ pub fn encode(
         && episode.available.len() == (steps + 1) * n * n_actions
         && episode.actions.len() == steps * n
         && episode.shaping.len() == steps
-        && episode.decision_order.len() == n;
-    if !fits {
-        return Err(EncodeError { n_agents: n, n_entities: m, steps, dims: layout.dims });
-    }
+        && episode.decision_order.len() == n
+}
 
-    frame.payload.clear();
-    frame.payload.resize(layout.len, 0);
-    let payload = &mut frame.payload[..];
+/// Writes an episode that [`fits`] into a payload of zeros.
+fn pad(episode: &Episode, layout: &PayloadLayout, payload: &mut [u8]) {
+    let Dims { entity_dim: d, n_actions, agents_max, entities_max, .. } = layout.dims;
+    let (n, m, steps) = (episode.n_agents, episode.n_entities, episode.steps());
     for time in 0..=steps {
         for row in 0..m {
             let to = 4 * d * (time * entities_max + padded_entity(row, n, agents_max));
@@ -231,9 +244,13 @@ pub fn encode(
         payload[layout.actions + time * agents_max..][..n].copy_from_slice(&episode.actions[time * n..][..n]);
     }
     payload[layout.decision_order..][..n].copy_from_slice(&episode.decision_order);
+}
 
+/// The header of an episode that [`fits`]; its checksum is still to come.
+fn header_of(episode: &Episode, layout: &PayloadLayout, run_id: RunId, actor: u32) -> Header {
+    let Dims { entity_dim, n_actions, agents_max, entities_max, steps_max } = layout.dims;
     // Limits of `Dims` make every narrowing below exact.
-    frame.header = Header {
+    Header {
         magic: MAGIC,
         layout_version: LAYOUT_VERSION,
         checksum: 0,
@@ -243,23 +260,21 @@ pub fn encode(
         payload_len: layout.len as u64,
         actor,
         task: episode.task as u32,
-        entity_dim: d as u16,
+        entity_dim: entity_dim as u16,
         n_actions: n_actions as u16,
         agents_max: agents_max as u16,
         entities_max: entities_max as u16,
         steps_max: steps_max as u16,
-        n_agents: n as u16,
-        n_entities: m as u16,
-        steps: steps as u16,
+        n_agents: episode.n_agents as u16,
+        n_entities: episode.n_entities as u16,
+        steps: episode.steps() as u16,
         end: match episode.end {
             End::Terminated => 1,
             End::Truncated => 2,
         },
         won: u8::from(episode.won),
         reserved: [0; 6],
-    };
-    frame.header.checksum = checksum(&frame.header, &frame.payload);
-    Ok(())
+    }
 }
 
 /// What a receiver knows of a run before a frame arrives.
@@ -278,12 +293,17 @@ pub struct Expected {
 /// # Errors
 /// The first thing found wrong. No bytes make it panic.
 pub fn decode(header: &Header, payload: &[u8], expected: &Expected) -> Result<Episode, Rejection> {
-    let layout = &expected.layout;
     check_header(header, payload, expected)?;
+    let episode = real_rows(header, payload, &expected.layout);
+    check_contents(&episode, expected.layout.dims.n_actions)?;
+    Ok(episode)
+}
+
+/// An episode's real rows, whatever they hold. The header has been checked against the payload.
+fn real_rows(header: &Header, payload: &[u8], layout: &PayloadLayout) -> Episode {
     let Dims { entity_dim: d, n_actions, agents_max, entities_max, .. } = layout.dims;
     let (n, m) = (usize::from(header.n_agents), usize::from(header.n_entities));
     let steps = usize::from(header.steps);
-
     let mut entities = Vec::with_capacity((steps + 1) * m * d);
     let mut observable = Vec::with_capacity((steps + 1) * n * m);
     let mut available = Vec::with_capacity((steps + 1) * n * n_actions);
@@ -308,35 +328,13 @@ pub fn decode(header: &Header, payload: &[u8], expected: &Expected) -> Result<Ep
     for time in 0..steps {
         actions.extend_from_slice(&payload[layout.actions + time * agents_max..][..n]);
     }
-    let decision_order = payload[layout.decision_order..][..n].to_vec();
-
-    for (section, numbers) in [("entities", &entities), ("rewards", &rewards), ("shaping", &shaping)] {
-        if !numbers.iter().fold(true, |finite, number| finite & number.is_finite()) {
-            return Err(Rejection::NotFinite { section });
-        }
-    }
-    for (section, flags) in [("observable", &observable), ("available", &available)] {
-        let worst = flags.iter().fold(0, |worst, &flag| worst.max(flag));
-        if worst > 1 {
-            return Err(Rejection::Flag { field: section, value: worst });
-        }
-    }
-    if !decision_order::is_permutation(&decision_order) {
-        return Err(Rejection::DecisionOrder);
-    }
-    for (row, (&action, allowed)) in actions.iter().zip(available.chunks_exact(n_actions)).enumerate() {
-        if allowed.get(usize::from(action)) != Some(&1) {
-            return Err(Rejection::Action { step: row / n, agent: row % n, action });
-        }
-    }
-
-    Ok(Episode {
+    Episode {
         number: header.episode,
         weights_version: header.weights_version,
         task: header.task as usize,
         n_agents: n,
         n_entities: m,
-        decision_order,
+        decision_order: payload[layout.decision_order..][..n].to_vec(),
         entities,
         observable,
         available,
@@ -345,7 +343,34 @@ pub fn decode(header: &Header, payload: &[u8], expected: &Expected) -> Result<Ep
         shaping,
         end: if header.end == 1 { End::Terminated } else { End::Truncated },
         won: header.won == 1,
-    })
+    }
+}
+
+/// Everything that can be said of an episode's rows.
+fn check_contents(episode: &Episode, n_actions: usize) -> Result<(), Rejection> {
+    let Episode { entities, rewards, shaping, observable, available, .. } = episode;
+    for (section, numbers) in [("entities", entities), ("rewards", rewards), ("shaping", shaping)] {
+        if !numbers.iter().fold(true, |finite, number| finite & number.is_finite()) {
+            return Err(Rejection::NotFinite { section });
+        }
+    }
+    for (section, flags) in [("observable", observable), ("available", available)] {
+        let worst = flags.iter().fold(0, |worst, &flag| worst.max(flag));
+        if worst > 1 {
+            return Err(Rejection::Flag { field: section, value: worst });
+        }
+    }
+    if !decision_order::is_permutation(&episode.decision_order) {
+        return Err(Rejection::DecisionOrder);
+    }
+    let allowed = available.chunks_exact(n_actions);
+    for (row, (&action, allowed)) in episode.actions.iter().zip(allowed).enumerate() {
+        if allowed.get(usize::from(action)) != Some(&1) {
+            let (step, agent) = (row / episode.n_agents, row % episode.n_agents);
+            return Err(Rejection::Action { step, agent, action });
+        }
+    }
+    Ok(())
 }
 
 /// Everything that can be said before the payload is read, and the checksum over both.

@@ -4,7 +4,7 @@ use crate::{
     protocol::{Answer, Open, Opened, Request, answer},
     worker::{Launch, Worker},
 };
-use rit_env::{EnvironmentError, FailureKind};
+use rit_env::{EnvironmentError, FailureKind, Spec};
 
 /// What the tasks of a run are.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -63,27 +63,71 @@ fn ask(worker: &mut Worker, task: &str) -> Result<Opened, EnvironmentError> {
         Err(error) => return Err(worker.misspoke(&error)),
     };
     worker.give_up(environment);
-    let Opened { n_agents, n_entities, n_features, n_actions, steps_max, .. } = *opened;
+    match check(&opened) {
+        Ok(()) => Ok(*opened),
+        Err(detail) => Err(EnvironmentError::new(FailureKind::BadAnswer, detail)),
+    }
+}
+
+/// Whether there is a task of these sizes, with a name for each feature and action; or what is wrong, in words.
+fn check(opened: &Opened) -> Result<(), String> {
+    let Opened { n_agents, n_entities, n_features, n_actions, steps_max, has_wins, .. } = *opened;
+    let spec = Spec {
+        n_agents,
+        n_entities,
+        feature_dim: n_features,
+        n_actions,
+        steps_max,
+        has_wins,
+        has_scenes: false,
+        is_reproducible: opened.is_reproducible == Some(true),
+    };
+    spec.check().map_err(|error| error.to_string())?;
     let named = [
         ("features", n_features, opened.feature_names.len()),
         ("actions", n_actions, opened.action_names.len()),
     ];
-    let fault = if n_agents == 0
-        || n_entities < n_agents
-        || n_features == 0
-        || n_actions == 0
-        || steps_max == 0
-    {
-        Some(format!(
-            "{n_agents} agents, {n_entities} entities (agents included), {n_features} features, {n_actions} actions and \
-             {steps_max} steps make no task"
-        ))
-    } else {
-        let wrong = named.into_iter().find(|(_, count, names)| count != names);
-        wrong.map(|(what, count, names)| format!("{names} names for {count} {what}"))
-    };
-    match fault {
-        Some(detail) => Err(EnvironmentError::new(FailureKind::BadAnswer, detail)),
-        None => Ok(*opened),
+    match named.into_iter().find(|(_, count, names)| count != names) {
+        Some((what, count, names)) => Err(format!("{names} names for {count} {what}")),
+        None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_makes_no_task_is_said() {
+        let names = |names: &[&str]| names.iter().map(|&name| name.to_owned()).collect();
+        let good = Opened {
+            n_agents: 2,
+            n_entities: 3,
+            n_features: 1,
+            n_actions: 2,
+            steps_max: 5,
+            has_wins: false,
+            feature_names: names(&["x"]),
+            action_names: names(&["stay", "go"]),
+            is_reproducible: None,
+        };
+        assert_eq!(check(&good), Ok(()));
+        let refused = |change: &dyn Fn(&mut Opened)| {
+            let mut opened = good.clone();
+            change(&mut opened);
+            check(&opened).unwrap_err()
+        };
+        let changes: [fn(&mut Opened); 5] = [
+            |opened| opened.n_agents = 0,
+            |opened| opened.n_entities = 1,
+            |opened| (opened.n_features, opened.feature_names) = (0, vec![]),
+            |opened| (opened.n_actions, opened.action_names) = (0, vec![]),
+            |opened| opened.steps_max = 0,
+        ];
+        for change in changes {
+            let message = refused(&change);
+            assert!(message.contains("make no task; it needs at least one agent"), "{message}");
+        }
+        assert_eq!(refused(&|opened| opened.n_actions = 3), "2 names for 3 actions");
     }
 }

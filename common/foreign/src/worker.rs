@@ -26,7 +26,7 @@ use std::{
 };
 
 /// What the first question, which no environment answers, is about.
-const NOBODY: u16 = u16::MAX;
+const NO_ENVIRONMENT: u16 = u16::MAX;
 
 /// How long a worker may take until it answers for the first time: it imports what environments need.
 const START_TIMEOUT: Duration = Duration::from_secs(120);
@@ -133,13 +133,15 @@ impl Worker {
             broken: None,
         };
         let hello = serde_json::to_vec(&Hello { protocol: PROTOCOL_VERSION }).unwrap_or_default();
-        worker.send(Request::Hello, NOBODY, &hello)?;
+        worker.send(Request::Hello, NO_ENVIRONMENT, &hello)?;
         Ok(worker)
     }
 
     /// Whether another environment may be made in it.
     pub(crate) fn has_room(&self, environments_per_worker: usize) -> bool {
-        self.broken.is_none() && self.environments.len() < environments_per_worker && self.next < NOBODY
+        self.broken.is_none()
+            && self.environments.len() < environments_per_worker
+            && self.next < NO_ENVIRONMENT
     }
 
     /// A number for another environment.
@@ -181,7 +183,7 @@ impl Worker {
         }
         loop {
             let (about, frame) = self.next_frame()?;
-            if about == NOBODY && !self.greeted {
+            if about == NO_ENVIRONMENT && !self.greeted {
                 self.greet(&frame)?;
             } else if about == environment {
                 return Ok(frame);

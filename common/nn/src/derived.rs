@@ -5,7 +5,7 @@
 //! gradients, so that networks use a derived layer like any other. [`Derived::extend`] makes them; [`Derived::backward`]
 //! turns their gradients into gradients by the parameters they are made of.
 
-use crate::{Accum, Attention, Linear, View, ViewMut, linear, math, matmul, vectorized};
+use crate::{Accum, Attention, Linear, View, linear, math, matmul, vectorized};
 
 /// Which layers are derived, and from what.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -111,7 +111,7 @@ impl Made {
                     matmul::dyt_x(key.weight(params), query.weight(params), to, Accum::Replace);
                     let bias = of.bias_mut(derived);
                     bias.fill(0.0);
-                    multiply_transposed(key.weight(params), query.bias(params), bias);
+                    linear::add_weighted_rows(bias, query.bias(params), key.weight(params));
                 }
             }
         }
@@ -131,8 +131,8 @@ impl Made {
                 let weight = second.weight(params).columns(made.clone());
                 matmul::dyt_x(weight, d_made, first.weight_mut(grads), Accum::Add);
                 let d_bias = of.bias(derived);
-                add_outer_product(second.weight_mut(grads).columns(made), d_bias, first.bias(params));
-                multiply_transposed(weight, d_bias, first.bias_mut(grads));
+                linear::add_outer_product(second.weight_mut(grads).columns(made), d_bias, first.bias(params));
+                linear::add_weighted_rows(first.bias_mut(grads), d_bias, weight);
                 math::add_scaled(second.bias_mut(grads), 1.0, d_bias);
             }
             Self::Scores { query, key, heads, of } => {
@@ -145,7 +145,7 @@ impl Made {
                     matmul::dy_w(key.weight(params), d, query.weight_mut(grads), Accum::Add);
                     matmul::x_wt(query.weight(params), d, key.weight_mut(grads), Accum::Add);
                     multiply(key.weight(params), d_bias, query.bias_mut(grads));
-                    add_outer_product(key.weight_mut(grads), query.bias(params), d_bias);
+                    linear::add_outer_product(key.weight_mut(grads), query.bias(params), d_bias);
                 }
             }
         }
@@ -172,29 +172,11 @@ vectorized! {
     }
 }
 
-vectorized! {
-    /// sums += wᵀ v: the rows weighted by a vector.
-    fn multiply_transposed<'a>(w: View<'a>, v: &'a [f32], sums: &'a mut [f32]) {
-        for (row, &weight) in v.iter().enumerate() {
-            math::add_scaled(sums, weight, w.row(row));
-        }
-    }
-}
-
-vectorized! {
-    /// Each row += its number of a · b.
-    fn add_outer_product<'a>(rows: ViewMut<'a>, a: &'a [f32], b: &'a [f32]) {
-        for (row, &weight) in a.iter().enumerate() {
-            math::add_scaled(rows.row(row), weight, b);
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::{
-        LayoutBuilder,
+        LayoutBuilder, ViewMut,
         gradcheck::{check, noise},
     };
 

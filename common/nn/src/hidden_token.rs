@@ -9,12 +9,11 @@
 
 mod attend;
 
-use crate::Accum;
 use crate::{
-    Attention, Buffer, LayoutBuilder, Scratch, View, ViewMut, activation,
+    Accum, Attention, Buffer, LayoutBuilder, Scratch, View, ViewMut, activation,
     attention::{Group, Visible},
     linear, math, matmul,
-    post_norm::{PostNorm, PostNormState},
+    post_norm::{PostNorm, PostNormGradients, PostNormState},
     vectorized,
 };
 use attend::{Tokens, attend, attend_backward};
@@ -149,58 +148,91 @@ impl HiddenToken {
         x: View<'_>,
         state: &HiddenTokenState,
         d_own: View<'_>,
-        mut d_x: ViewMut<'_>,
+        d_x: ViewMut<'_>,
         grads: &mut [f32],
         scratch: &mut Scratch,
     ) {
-        let (h, a, rows) = (self.dim(), self.attention.dim, places.rows());
-        let mut d_u = scratch.take(2 * rows * h);
-        let mut d_queries = scratch.take(2 * rows * a);
-        let mut d_attended = scratch.take(2 * rows * a);
-        let mut d_entities = scratch.take_zeros(x.rows * 2 * a);
-        let mut d_hidden = scratch.take(rows * 2 * a);
-        let HiddenTokenState {
-            u,
-            queries,
-            entities,
-            hidden,
-            hidden_weights,
-            own_weights,
-            attended,
-            post_norm,
-            ..
-        } = state;
-        let mut d_post_norm = self.post_norm.gradients(post_norm, scratch);
+        let mut d = self.gradients(places, x.rows, state, scratch);
+        self.backward_own(params, places, state, d_own, &mut d, grads);
+        let mut d_out = scratch.take_zeros(places.rows() * self.dim());
+        self.backward_recurrence(params, places, state, &mut d_out, &mut d, grads);
+        scratch.give(d_out);
+        let attended = View::dense(&state.attended, self.attention.dim);
+        self.post_norm.backward_params(attended, &state.post_norm, &d.post_norm, grads);
+        self.backward_projections(params, places, x, state, &mut d, d_x, grads);
+        d.give(scratch);
+    }
 
-        // The agents' own rows of all times.
-        let (d_u_hidden, d_u_own) = d_u.split_at_mut(rows * h);
-        let (d_queries_hidden, d_queries_own) = d_queries.split_at_mut(rows * a);
-        let (d_attended_hidden, d_attended_own) = d_attended.split_at_mut(rows * a);
+    /// Room for the gradients, those that are only added to being zeros.
+    fn gradients(
+        &self,
+        places: Places<'_>,
+        entities: usize,
+        state: &HiddenTokenState,
+        scratch: &mut Scratch,
+    ) -> HiddenTokenGradients {
+        let (h, a, rows) = (self.dim(), self.attention.dim, places.rows());
+        HiddenTokenGradients {
+            u: scratch.take(2 * rows * h),
+            queries: scratch.take(2 * rows * a),
+            attended: scratch.take(2 * rows * a),
+            entities: scratch.take_zeros(entities * 2 * a),
+            hidden: scratch.take_zeros(rows * 2 * a),
+            post_norm: self.post_norm.gradients(&state.post_norm, scratch),
+        }
+    }
+
+    /// The agents' own rows of all times: writes their `d.u`, `d.queries` and `d.attended`, and adds to `d.entities` and
+    /// `d.hidden`.
+    fn backward_own(
+        &self,
+        params: &[f32],
+        places: Places<'_>,
+        state: &HiddenTokenState,
+        d_own: View<'_>,
+        d: &mut HiddenTokenGradients,
+        grads: &mut [f32],
+    ) {
+        let (h, a, rows) = (self.dim(), self.attention.dim, places.rows());
+        let HiddenTokenState { queries, entities, hidden, own_weights, post_norm, .. } = state;
+        let d_attended = &mut d.attended[rows * a..];
         self.post_norm.backward(
             params,
             rows..2 * rows,
             post_norm,
-            &mut d_post_norm,
+            &mut d.post_norm,
             d_own,
-            ViewMut::dense(d_u_own, h),
-            ViewMut::dense(d_attended_own, a),
+            ViewMut::dense(&mut d.u[rows * h..], h),
+            ViewMut::dense(d_attended, a),
             grads,
         );
-        let tokens = Tokens { queries: View::dense(&queries[rows * a..], a), entities, hidden };
-        d_hidden.fill(0.0);
         attend_backward(
-            tokens,
+            Tokens { queries: View::dense(&queries[rows * a..], a), entities, hidden },
             places.groups,
             own_weights,
-            View::dense(d_attended_own, a),
-            [d_queries_own, &mut d_entities, &mut d_hidden],
+            View::dense(d_attended, a),
+            [&mut d.queries[rows * a..], &mut d.entities, &mut d.hidden],
             self.head_dim(),
         );
+    }
 
-        // Hidden tokens, from the last time to the first.
-        let mut d_out = scratch.take_zeros(rows * h);
-        let mut weights = hidden_weights.len();
+    /// Hidden tokens, from the last time to the first: writes their `d.u`, `d.queries` and `d.attended`, and adds to
+    /// `d.entities` and `d.hidden`. `d_out` `[R, h]` collects the gradient by what became of them, zeros at first.
+    fn backward_recurrence(
+        &self,
+        params: &[f32],
+        places: Places<'_>,
+        state: &HiddenTokenState,
+        d_out: &mut [f32],
+        d: &mut HiddenTokenGradients,
+        grads: &mut [f32],
+    ) {
+        let (h, a, rows) = (self.dim(), self.attention.dim, places.rows());
+        let HiddenTokenState { queries, entities, hidden, hidden_weights, post_norm, .. } = state;
+        let (d_u, d_queries) = (&mut d.u[..rows * h], &mut d.queries[..rows * a]);
+        let d_attended = &mut d.attended[..rows * a];
         let tokens = Tokens { queries: View::dense(&queries[..rows * a], a), entities, hidden };
+        let mut weights = hidden_weights.len();
         for time in (0..places.times()).rev() {
             let (groups, range) = places.at(time);
             let part = weights - self.weights(groups)..weights;
@@ -209,64 +241,62 @@ impl HiddenToken {
                 params,
                 range.clone(),
                 post_norm,
-                &mut d_post_norm,
-                View::dense(&d_out, h).rows(range.clone()),
-                ViewMut::dense(d_u_hidden, h).rows(range.clone()),
-                ViewMut::dense(d_attended_hidden, a).rows(range.clone()),
+                &mut d.post_norm,
+                View::dense(d_out, h).rows(range.clone()),
+                ViewMut::dense(d_u, h).rows(range.clone()),
+                ViewMut::dense(d_attended, a).rows(range.clone()),
                 grads,
             );
-            attend_backward(
-                tokens,
-                groups,
-                &hidden_weights[part],
-                View::dense(d_attended_hidden, a),
-                [d_queries_hidden, &mut d_entities, &mut d_hidden],
-                self.head_dim(),
-            );
-            let of_hidden = ViewMut::dense(&mut d_hidden, 2 * a).rows(range.clone());
+            let d_tokens: [&mut [f32]; 3] = [&mut *d_queries, &mut d.entities, &mut d.hidden];
+            let d_attended = View::dense(d_attended, a);
+            attend_backward(tokens, groups, &hidden_weights[part], d_attended, d_tokens, self.head_dim());
+            let of_hidden = ViewMut::dense(&mut d.hidden, 2 * a).rows(range.clone());
             let values = View::dense(hidden, 2 * a).rows(range.clone()).columns(a..2 * a);
             activation::relu_backward(values, of_hidden.columns(a..2 * a));
             if time > 0 {
-                let d_queries = View::dense(d_queries_hidden, a).rows(range.clone());
-                let d_hidden = View::dense(&d_hidden, 2 * a).rows(range.clone());
+                let d_queries = View::dense(d_queries, a).rows(range.clone());
+                let d_hidden = View::dense(&d.hidden, 2 * a).rows(range.clone());
                 let first = places.agent_times[time - 1];
-                let mut d_previous = ViewMut::dense(&mut d_out, h).rows(first..first + range.len());
-                linear::add(d_previous.reborrow(), View::dense(d_u_hidden, h).rows(range.clone()));
+                let mut d_previous = ViewMut::dense(d_out, h).rows(first..first + range.len());
+                linear::add(d_previous.reborrow(), View::dense(d_u, h).rows(range));
                 let weight = self.attention.query.weight(params);
                 matmul::dy_w(d_queries, weight, d_previous.reborrow(), Accum::Add);
                 matmul::dy_w(d_hidden, self.attention.key_value.weight(params), d_previous, Accum::Add);
             }
         }
-        scratch.give(d_out);
+    }
 
-        self.post_norm.backward_params(View::dense(attended, a), post_norm, &d_post_norm, grads);
-        d_post_norm.give(scratch);
-        let (u, d_queries_all) = (View::dense(u, h), View::dense(&d_queries, a));
-        self.attention.query.backward_params(u, d_queries_all, grads);
-        let values = View::dense(entities, 2 * a).columns(a..2 * a);
-        activation::relu_backward(values, ViewMut::dense(&mut d_entities, 2 * a).columns(a..2 * a));
-        for (x, d) in [(x, &d_entities), (u.rows(0..rows), &d_hidden)] {
+    /// From the gradients by queries, keys and values to those by their layers and, written, by `x`.
+    #[allow(clippy::too_many_arguments, reason = "a matrix and its companions, each named")]
+    fn backward_projections(
+        &self,
+        params: &[f32],
+        places: Places<'_>,
+        x: View<'_>,
+        state: &HiddenTokenState,
+        d: &mut HiddenTokenGradients,
+        mut d_x: ViewMut<'_>,
+        grads: &mut [f32],
+    ) {
+        let (h, a, rows) = (self.dim(), self.attention.dim, places.rows());
+        let u = View::dense(&state.u, h);
+        let Attention { query, key_value, .. } = &self.attention;
+        query.backward_params(u, View::dense(&d.queries, a), grads);
+        let values = View::dense(&state.entities, 2 * a).columns(a..2 * a);
+        activation::relu_backward(values, ViewMut::dense(&mut d.entities, 2 * a).columns(a..2 * a));
+        for (x, d) in [(x, &d.entities), (u.rows(0..rows), &d.hidden)] {
             let d = View::dense(d, 2 * a);
-            matmul::dyt_x(d, x, self.attention.key_value.weight_mut(grads), Accum::Add);
+            matmul::dyt_x(d, x, key_value.weight_mut(grads), Accum::Add);
             // The key's bias has no gradient, because softmax cancels it: see `Attention::project_keys`.
-            let bias = &mut self.attention.key_value.bias_mut(grads)[a..];
-            linear::add_column_sums(d.columns(a..2 * a), bias);
+            linear::add_column_sums(d.columns(a..2 * a), &mut key_value.bias_mut(grads)[a..]);
         }
-        let d_entities_view = View::dense(&d_entities, 2 * a);
-        matmul::dy_w(
-            d_entities_view,
-            self.attention.key_value.weight(params),
-            d_x.reborrow(),
-            Accum::Replace,
-        );
+        let d_entities = View::dense(&d.entities, 2 * a);
+        matmul::dy_w(d_entities, key_value.weight(params), d_x.reborrow(), Accum::Replace);
         // An agent's own x is both the query and the residual that the attention's output is added to.
-        let d_queries_own = View::dense(&d_queries[rows * a..], a);
-        let d_own_u = ViewMut::dense(&mut d_u[rows * h..], h);
-        matmul::dy_w(d_queries_own, self.attention.query.weight(params), d_own_u, Accum::Add);
-        add_to_agents(places.groups, View::dense(&d_u[rows * h..], h), d_x);
-        for buffer in [d_u, d_queries, d_attended, d_entities, d_hidden] {
-            scratch.give(buffer);
-        }
+        let d_queries = View::dense(&d.queries[rows * a..], a);
+        let d_own_u = &mut d.u[rows * h..];
+        matmul::dy_w(d_queries, query.weight(params), ViewMut::dense(d_own_u, h), Accum::Add);
+        add_to_agents(places.groups, View::dense(d_own_u, h), d_x);
     }
 
     /// Entities' keys and values, agents' own rows and their queries.
@@ -286,7 +316,7 @@ impl HiddenToken {
         }
         let queries = ViewMut::dense(&mut state.queries[rows * a..], a);
         self.attention.query.forward(params, View::dense(&u[rows * h..], h), queries);
-        self.keys_and_values(params, x, ViewMut::dense(&mut state.entities, 2 * a));
+        self.attention.project_keys(params, x, ViewMut::dense(&mut state.entities, 2 * a));
     }
 
     /// These rows' hidden tokens, zeros or the first of `previous`, and their queries, keys and values.
@@ -307,14 +337,7 @@ impl HiddenToken {
         }
         let u = View::dense(u, h);
         self.attention.query.forward(params, u, ViewMut::dense(&mut state.queries, a).rows(rows.clone()));
-        self.keys_and_values(params, u, ViewMut::dense(&mut state.hidden, 2 * a).rows(rows));
-    }
-
-    /// Keys without their bias, and ReLU'd values.
-    fn keys_and_values(&self, params: &[f32], x: View<'_>, mut to: ViewMut<'_>) {
-        let (a, layer) = (self.attention.dim, &self.attention.key_value);
-        matmul::x_wt(x, layer.weight(params), to.reborrow(), Accum::Replace);
-        linear::add_row_relu(to.columns(a..2 * a), &layer.bias(params)[a..]);
+        self.attention.project_keys(params, u, ViewMut::dense(&mut state.hidden, 2 * a).rows(rows));
     }
 
     /// All that follows the attention, of these of the 2R rows.
@@ -333,6 +356,27 @@ impl HiddenToken {
 
     fn head_dim(&self) -> usize {
         self.attention.dim / self.attention.heads
+    }
+}
+
+/// Gradients by parts of [`HiddenTokenState`], in its rows.
+struct HiddenTokenGradients {
+    u: Buffer,
+    queries: Buffer,
+    attended: Buffer,
+    entities: Buffer,
+    hidden: Buffer,
+    post_norm: PostNormGradients,
+}
+
+impl HiddenTokenGradients {
+    /// Gives all buffers back.
+    fn give(self, scratch: &mut Scratch) {
+        let Self { u, queries, attended, entities, hidden, post_norm } = self;
+        for buffer in [u, queries, attended, entities, hidden] {
+            scratch.give(buffer);
+        }
+        post_norm.give(scratch);
     }
 }
 

@@ -176,6 +176,24 @@ vectorized! {
     }
 }
 
+vectorized! {
+    /// sums += Σ weight · row of x: xᵀ weights.
+    pub fn add_weighted_rows<'a>(sums: &'a mut [f32], weights: &'a [f32], x: View<'a>) {
+        for (row, &weight) in weights.iter().enumerate() {
+            math::add_scaled(sums, weight, x.row(row));
+        }
+    }
+}
+
+vectorized! {
+    /// Each row of y += its weight · x: y += weights xᵀ.
+    pub fn add_outer_product<'a>(y: ViewMut<'a>, weights: &'a [f32], x: &'a [f32]) {
+        for (row, &weight) in weights.iter().enumerate() {
+            math::add_scaled(y.row(row), weight, x);
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -206,6 +224,17 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn products_with_vectors_by_hand() {
+        let x = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0];
+        let mut sums = [10.0, 20.0, 30.0];
+        add_weighted_rows(&mut sums, &[2.0, -1.0], View::dense(&x, 3));
+        assert_eq!(sums, [8.0, 19.0, 30.0]);
+        let mut y = [1.0; 4];
+        add_outer_product(ViewMut::dense(&mut y, 2), &[2.0, -1.0], &[3.0, 5.0]);
+        assert_eq!(y, [7.0, 11.0, -2.0, -4.0]);
     }
 
     #[test]

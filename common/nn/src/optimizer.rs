@@ -56,15 +56,19 @@ impl Optimizer {
                 rmsprop(params, grads, &mut self.mean_square, [scale, self.lr, alpha, eps]);
             }
             OptimizerKind::Adam { beta1, beta2, eps } => {
-                // The corrections are taken in f64, as PyTorch takes them.
-                let correction = |beta: f32| 1.0 - f64::from(beta).powf(self.steps as f64);
-                let rate = (f64::from(self.lr) / correction(beta1)) as f32;
-                let root = correction(beta2).sqrt() as f32;
+                let rate = (f64::from(self.lr) / bias_correction(beta1, self.steps)) as f32;
+                let root = bias_correction(beta2, self.steps).sqrt() as f32;
                 let moments = (&mut self.mean[..], &mut self.mean_square[..]);
                 adam(params, grads, moments, [scale, beta1, beta2, rate, root, eps]);
             }
         }
     }
+}
+
+/// 1 − βᵗ: how much of a moment's weight is real after so many steps. In f64, as PyTorch takes it, and not by the system's
+/// library, whose last bit differs from one machine to the next.
+fn bias_correction(beta: f32, steps: u64) -> f64 {
+    1.0 - libm::pow(f64::from(beta), steps as f64)
 }
 
 vectorized! {
@@ -153,6 +157,21 @@ mod tests {
         optimizer.step(&mut p, &[-1.0], 1.0);
         let (m, v): (f64, f64) = (0.9 * 0.05 - 0.1, 0.99 * 0.0025 + 0.01);
         close(p[0], 0.9 - 0.1 * (m / 0.19) / (v / 0.0199).sqrt());
+    }
+
+    /// The same bits on every machine: these are steps at which a system's `pow` rounds otherwise.
+    #[test]
+    fn bias_corrections_are_not_the_systems() {
+        for (beta, steps, bits) in [
+            (0.9, 3, 0x3fd1_5810_a083_1254_u64),
+            (0.95, 4, 0x3fc7_be42_b2b9_f540),
+            (0.99, 9, 0x3fb6_23ba_7d90_b160),
+            (0.999, 31, 0x3f9f_45a2_b96d_9800),
+        ] {
+            let correction = bias_correction(beta, steps);
+            assert_eq!(correction.to_bits(), bits, "{beta}, {steps}: {correction}");
+            assert!((correction - (1.0 - f64::from(beta).powf(steps as f64))).abs() < 1e-15);
+        }
     }
 
     #[test]

@@ -76,7 +76,7 @@ pub enum ActError {
         /// It.
         reward: f32,
     },
-    /// A decision order that leaves somebody out.
+    /// A decision order that lacks an agent.
     #[error("episode {episode}: the decision order must have each of 0 to {} once", n_agents - 1)]
     Order {
         /// Which episode.

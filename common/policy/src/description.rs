@@ -196,6 +196,20 @@ mod tests {
         assert_eq!(description.model().unwrap().encoder, Encoder::Beside);
     }
 
+    /// Files of builds that wrote down sizes which MAPPO has no use for.
+    #[test]
+    fn a_size_that_its_method_has_no_use_for_changes_nothing() {
+        let config = config(&["algorithm.name=mappo"]);
+        let description = Description::new(&config.model(), &TaskNames::of(&config), String::new());
+        assert!(!description.sizes.contains_key("n_heads") && !description.sizes.contains_key("n_blocks"));
+        let mut older = description.clone();
+        older.sizes.extend([("n_heads".to_owned(), 4), ("n_blocks".to_owned(), 1)]);
+        let layout = |described: &Description| {
+            rit_algo::Model::new(described.model().unwrap()).unwrap().layout().clone()
+        };
+        assert_eq!(layout(&older), layout(&description));
+    }
+
     #[test]
     fn what_makes_no_model_is_named() {
         let config = config(&[]);

@@ -23,7 +23,7 @@ pub enum Ended {
     Finished,
     /// An evaluation has reached what `training.until` asks for.
     Until,
-    /// Somebody asked it to stop: `rit ctl stop`, or the page.
+    /// It was asked to stop, by `rit ctl stop` or on the page.
     Stopped,
     /// A signal, Ctrl-C or a terminal that closed asked it to end, or the process that watched over it has gone.
     Interrupted,
@@ -124,7 +124,7 @@ pub struct Summary {
     /// The best policy, where it is kept.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub best: Option<Best>,
-    /// What the last learner found or did that somebody should know of.
+    /// Warnings of the last learner.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub warnings: Vec<String>,
     /// What this build does not know.

@@ -21,7 +21,7 @@ mod table;
 pub use comparison::{Group, Method, Options, Settings, groups};
 pub use error::ReportError;
 pub use measure::{Measure, signed};
-pub use page::{CSS, Section, page};
+pub use page::{CSS, GENERATOR, Section, page};
 pub use shapley::figure as shapley_figure;
 pub use table::Table;
 

@@ -37,7 +37,10 @@ impl Section {
 /// How a page looks.
 pub const CSS: &str = include_str!("page.css");
 
-/// The page of these sections: with its looks in it, or where they lie.
+/// What tells the page of a report, which may be written over, from pages that other programs made.
+pub const GENERATOR: &str = "<meta name=\"generator\" content=\"rit report\">";
+
+/// The page of these sections: with its looks in it, as a report has it, or where they lie.
 pub fn page(title: &str, sections: &[Section], stylesheet: Option<&str>) -> String {
     let title = escaped(title);
     let mut html = String::from(
@@ -47,7 +50,11 @@ pub fn page(title: &str, sections: &[Section], stylesheet: Option<&str>) -> Stri
     );
     let looks = match stylesheet {
         Some(address) => format!("<link rel=\"stylesheet\" href=\"{}\">", escaped(address)),
-        None => format!("<style>\n{CSS}</style>"),
+        None => {
+            html += GENERATOR;
+            html += "\n";
+            format!("<style>\n{CSS}</style>")
+        }
     };
     // Writing to a String does not fail.
     let _ = write!(html, "<title>{title}</title>\n{looks}\n</head>\n<body>\n");

@@ -48,7 +48,7 @@ pub enum ConnectionError {
         reason: String,
     },
     /// What came is no response.
-    #[error("the answer to {request} is none of StarCraft II: {reason}")]
+    #[error("the answer to {request} is not a StarCraft II response: {reason}")]
     Garbage {
         /// What was asked.
         request: &'static str,
@@ -181,7 +181,10 @@ impl Connection {
                 Message::Binary(bytes) => break bytes,
                 Message::Ping(_) | Message::Pong(_) | Message::Frame(_) => {}
                 Message::Close(_) => {
-                    return Err(ConnectionError::Closed { request, reason: "it said goodbye".into() });
+                    return Err(ConnectionError::Closed {
+                        request,
+                        reason: "it closed the connection".into(),
+                    });
                 }
                 Message::Text(text) => {
                     let reason = format!("text, {}", shown(&text));
@@ -211,7 +214,7 @@ impl Connection {
                 ConnectionError::Closed { request, reason: "the other side has gone".into() }
             }
             Error::Protocol(tungstenite::error::ProtocolError::ResetWithoutClosingHandshake) => {
-                ConnectionError::Closed { request, reason: "it broke off".into() }
+                ConnectionError::Closed { request, reason: "the connection was reset".into() }
             }
             error => ConnectionError::Garbage { request, reason: shown(&error) },
         }

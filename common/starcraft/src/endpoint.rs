@@ -17,10 +17,15 @@ use std::{
         atomic::{AtomicUsize, Ordering},
     },
     thread,
+    time::Duration,
 };
 
 /// Games that are played at once, at most.
 const GAMES_MAX: usize = 256;
+
+/// How long no client is accepted after the system could not: without a pause, running out of files would take all CPU time
+/// too.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
 /// What the endpoint plays, and what it says of itself.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -83,39 +88,68 @@ impl Endpoint {
         self.listener.local_addr()
     }
 
-    /// Plays with every client that connects, many at once, as long as it can listen.
-    ///
-    /// # Errors
-    /// When it cannot any more.
-    pub fn serve(&self) -> io::Result<()> {
+    /// Plays with every client that connects, many at once, until the process ends.
+    pub fn serve(&self) {
         let games = Arc::new(AtomicUsize::new(0));
         loop {
-            let (stream, client) = self.listener.accept()?;
+            let (stream, client) = next_client(|| self.listener.accept());
             if games.load(Ordering::Relaxed) >= GAMES_MAX {
                 tracing::warn!(%client, "refused: {GAMES_MAX} games are played already");
                 continue;
             }
-            games.fetch_add(1, Ordering::Relaxed);
-            let (options, playing) = (self.options.clone(), Arc::clone(&games));
+            let (options, playing) = (self.options.clone(), Playing::begin(&games));
             let play = move || {
+                let _playing = playing;
                 play(stream, client, options);
-                playing.fetch_sub(1, Ordering::Relaxed);
             };
-            thread::Builder::new().name("game".into()).spawn(play)?;
+            if let Err(error) = thread::Builder::new().name("game".into()).spawn(play) {
+                tracing::error!(%client, %error, "refused: the system gives no thread for a game");
+                thread::sleep(ACCEPT_PAUSE);
+            }
         }
     }
 
     /// Plays with one client after another, as the game does, until one of them asks it to quit.
-    ///
-    /// # Errors
-    /// When it cannot listen any more.
-    pub fn serve_as_a_game(&self) -> io::Result<()> {
+    pub fn serve_as_a_game(&self) {
         loop {
-            let (stream, client) = self.listener.accept()?;
+            let (stream, client) = next_client(|| self.listener.accept());
             if play(stream, client, self.options.clone()) {
-                return Ok(());
+                return;
             }
         }
+    }
+}
+
+/// The next client. A client that has gone before it was accepted, or too many open files, end no game that is played: what
+/// is wrong is logged once in a row, and tried again.
+fn next_client(mut accept: impl FnMut() -> io::Result<(TcpStream, SocketAddr)>) -> (TcpStream, SocketAddr) {
+    let mut logged = String::new();
+    loop {
+        let error = match accept() {
+            Ok(client) => return client,
+            Err(error) => error.to_string(),
+        };
+        if error != logged {
+            tracing::error!(error, "cannot accept clients");
+            logged = error;
+        }
+        thread::sleep(ACCEPT_PAUSE);
+    }
+}
+
+/// A game that is played counts until this goes, however that comes about.
+struct Playing(Arc<AtomicUsize>);
+
+impl Playing {
+    fn begin(games: &Arc<AtomicUsize>) -> Self {
+        games.fetch_add(1, Ordering::Relaxed);
+        Self(Arc::clone(games))
+    }
+}
+
+impl Drop for Playing {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Relaxed);
     }
 }
 
@@ -158,4 +192,34 @@ fn fresh_seed() -> u64 {
     // So few bytes come at once; without them all such games are the same.
     let _ = rustix::rand::getrandom(&mut bytes, rustix::rand::GetRandomFlags::empty());
     u64::from_le_bytes(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_cannot_be_accepted_ends_no_listening() {
+        let listener = TcpListener::bind(("127.0.0.1", 0)).unwrap();
+        let client = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+        let mut failures = vec![rustix::io::Errno::MFILE, rustix::io::Errno::CONNABORTED];
+        let (_, address) = next_client(|| match failures.pop() {
+            Some(failure) => Err(failure.into()),
+            None => listener.accept(),
+        });
+        assert_eq!(address, client.local_addr().unwrap());
+    }
+
+    #[test]
+    fn a_game_that_panics_is_no_longer_counted() {
+        let games = Arc::new(AtomicUsize::new(0));
+        let playing = Playing::begin(&games);
+        assert_eq!(games.load(Ordering::Relaxed), 1);
+        let game = thread::spawn(move || {
+            let _playing = playing;
+            panic!("a fault of the game");
+        });
+        assert!(game.join().is_err());
+        assert_eq!(games.load(Ordering::Relaxed), 0);
+    }
 }

@@ -70,7 +70,7 @@ pub struct Setup {
 #[derive(Debug)]
 pub struct Game {
     connection: Connection,
-    /// `None` where somebody else has started it.
+    /// `None` where another program has started it.
     process: Option<GameProcess>,
     custom: CustomTypes,
     pathing: Pathing,
@@ -111,7 +111,7 @@ impl Game {
         Self::join(connection, Some(process), setup)
     }
 
-    /// Makes a game ready that somebody has started, by a connection to it.
+    /// Makes a game ready that another program has started, by a connection to it.
     ///
     /// # Errors
     /// When it is not what it must be.
@@ -168,8 +168,7 @@ impl Game {
 
     /// Whether it is too old for another battle of so many steps.
     pub fn is_spent(&self, steps_max: usize) -> bool {
-        let battle = (TICKS_PER_STEP * steps_max) as u32 + UNITS_WITHIN * 2 + SETTLE;
-        self.loops + battle >= LOOPS_MAX
+        is_spent(self.loops, steps_max)
     }
 
     /// Asks for what [`Self::begin_battle`] needs first, so that several games get to it at once.
@@ -312,7 +311,7 @@ impl Game {
     }
 
     /// Sends the opponent's units to the middle of the others, attacking what they meet. Where the game refuses, control
-    /// of them was toggled away by somebody before, and is toggled back.
+    /// of them was toggled away before, and is toggled back.
     fn send_enemies(&mut self, units: &[Unit]) -> Result<(), StarCraftError> {
         let of = |owner: i32| units.iter().filter(move |unit| unit.owner() == owner);
         let count = of(1).count().max(1) as f64;
@@ -407,6 +406,13 @@ impl Game {
     }
 }
 
+/// Whether a game of so many loops is too old for another battle. The game says how many loops there were, so that may be any
+/// number.
+fn is_spent(loops: u32, steps_max: usize) -> bool {
+    let battle = (TICKS_PER_STEP * steps_max) as u32 + UNITS_WITHIN * 2 + SETTLE;
+    loops.saturating_add(battle) >= LOOPS_MAX
+}
+
 fn observation() -> Request {
     Request::Observation(RequestObservation::default())
 }
@@ -437,4 +443,17 @@ fn command(units: &[u64], order: UnitOrder) -> Action {
 /// [`Connection`] has compared the names, so this does not come about.
 fn odd(request: &'static str) -> StarCraftError {
     ConnectionError::Garbage { request, reason: "it answers another request".into() }.into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_game_is_spent_however_many_loops_it_says_it_has_run() {
+        assert!(!is_spent(0, 60));
+        for loops in [LOOPS_MAX - 1, LOOPS_MAX, u32::MAX] {
+            assert!(is_spent(loops, 60), "{loops}");
+        }
+    }
 }

@@ -173,7 +173,7 @@ impl Installation {
         Ok(Self { folder, program, build, data_version, map })
     }
 
-    /// What somebody should know of it.
+    /// What its user should know of it.
     pub fn notice(&self) -> Option<String> {
         (!BUILDS_USED.contains(&self.build)).then(|| {
             format!(

@@ -17,7 +17,7 @@ const CUSTOM_MIN: u32 = 1900;
 
 /// Beyond this no number of a unit can be: places are cells, the sturdiest unit has some hundred points.
 const NUMBER_MAX: f32 = 1e5;
-/// Nobody has less health when unhurt.
+/// Every unit has at least this health when unhurt.
 const HEALTH_MIN: f32 = 1.0;
 
 /// Types that are created to find the row by what they look like, at most.
@@ -115,7 +115,7 @@ impl CustomTypes {
             let (side, kind) = match unit.owner() {
                 1 => (Side::Ally, self.kind(unit.unit_type())),
                 2 => (Side::Enemy, standard_kind(unit.unit_type())),
-                // Nobody's: what the map is decorated with.
+                // Neutral units, such as decoration of the map.
                 _ => continue,
             };
             let kind =

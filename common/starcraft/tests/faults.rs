@@ -1,4 +1,4 @@
-//! What a game, a network or somebody else's program may do to a client: each time an error that says so, within the
+//! What a game, a network or another program may do to a client: each time an error that says so, within the
 //! deadline, and the next world works.
 
 #![allow(clippy::panic, clippy::unwrap_used, clippy::expect_used, reason = "test code")]

@@ -64,7 +64,7 @@ fn text_that_is_none_and_messages_in_pieces_are_understood() {
 }
 
 #[test]
-fn whoever_wants_something_else_gets_404() {
+fn a_client_that_wants_something_else_gets_404() {
     let address = endpoint(Options::default());
     for (path, begins) in [("/", "HTTP/1.1 404"), ("/sc2api", "HTTP/1.1 101")] {
         let mut stream = TcpStream::connect(address).unwrap();
@@ -93,11 +93,11 @@ fn as_a_game_it_ends_when_a_client_asks_it_to_quit() {
     let endpoint = Endpoint::bind(([127, 0, 0, 1], 0).into(), Options::default()).unwrap();
     let address = endpoint.address().unwrap();
     let served = thread::spawn(move || endpoint.serve_as_a_game());
-    // One client goes without a word; the next ends the game.
+    // One client closes its connection and says nothing; the next ends the game.
     drop(connect(address));
     let mut socket = connect(address);
     let quit = Request { request: Some(Asked::Quit(RequestQuit {})), id: Some(1) }.encode_to_vec();
     socket.send(Message::Binary(quit.into())).unwrap();
     assert_eq!(answer(&mut socket).status(), Status::Quit);
-    served.join().unwrap().unwrap();
+    served.join().unwrap();
 }

@@ -25,8 +25,8 @@ pub fn factory(config: &Config) -> Arc<dyn EnvironmentFactory> {
     }
 }
 
-/// Whether this machine has what a configuration's worlds need; looks, and starts nothing. Returns what somebody should
-/// know of it.
+/// Whether this machine has what a configuration's worlds need; looks, and starts nothing. Returns a warning, if there is
+/// one.
 ///
 /// # Errors
 /// With what is missing, and where to get it.

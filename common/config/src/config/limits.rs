@@ -51,7 +51,8 @@ impl Config {
             ("algorithm.entropy_coef", algorithm.entropy_coef.into(), 0.0, 1e6),
             ("algorithm.value_coef", algorithm.value_coef.into(), 0.0, 1e6),
             ("algorithm.huber_delta", algorithm.huber_delta.into(), 1e-6, 1e6),
-            ("algorithm.value_norm_beta", algorithm.value_norm_beta.into(), 0.0, 1.0),
+            // At 1 the normaliser would never take a return in.
+            ("algorithm.value_norm_beta", algorithm.value_norm_beta.into(), 0.0, 0.999_999),
             ("network.hidden_dim", network.hidden_dim.into(), 1.0, SIZE),
             ("network.attention_dim", network.attention_dim.into(), 1.0, SIZE),
             ("network.n_heads", network.n_heads.into(), 1.0, 64.0),

@@ -109,15 +109,15 @@ fn errors_name_the_key_and_the_remedy() {
             "environment.approach_shaping means nothing to matrix-game; leave it out",
         ),
         ("environment.physics=mpe2", "environment.physics means nothing to matrix-game; leave it out"),
-        ("environment.physics=mpe", "environment.physics = \"mpe\" is none of its choices: original, mpe2"),
+        ("environment.physics=mpe", "environment.physics = \"mpe\" is not one of: original, mpe2"),
         ("environment.view_radius=1", "environment.view_radius means nothing to matrix-game; leave it out"),
         ("network.n_heads=3", "network.attention_dim = 64 is not a multiple of network.n_heads = 3"),
         ("algorithm.mixing=vdn", "algorithm.mixing must be \"network\" or \"sum\""),
         (
             "environment.spawn_rotate=x",
-            "environment.spawn_rotate = \"x\" is none of its choices: published, always, never",
+            "environment.spawn_rotate = \"x\" is not one of: published, always, never",
         ),
-        ("algorithm.optimizer=sgd", "algorithm.optimizer = \"sgd\" is none of its choices: rmsprop, adam"),
+        ("algorithm.optimizer=sgd", "algorithm.optimizer = \"sgd\" is not one of: rmsprop, adam"),
         ("web.listen=8080", "web.listen = \"8080\"; write \"127.0.0.1:PORT\" or \"off\""),
         (
             "algorithm.gamma",
@@ -131,8 +131,12 @@ fn errors_name_the_key_and_the_remedy() {
         assert_eq!(refused(&[setting]), message, "{setting}");
     }
     assert_eq!(
+        refused(&["algorithm.name=mappo", "algorithm.value_norm_beta=1"]),
+        "algorithm.value_norm_beta = 1 is out of range 0..=0.999999"
+    );
+    assert_eq!(
         refused(&["algorithm.name=refil", "algorithm.encoder=x"]),
-        "algorithm.encoder = \"x\" is none of its choices: within, beside"
+        "algorithm.encoder = \"x\" is not one of: within, beside"
     );
     assert!(refused(&["training.until=win_rate=2"]).contains("write win_rate=NUMBER"));
     assert!(refused(&["web.listen=0.0.0.0:8080"]).contains("ssh -L 8080:127.0.0.1:8080 THIS-MACHINE"));
@@ -195,6 +199,34 @@ fn a_list_is_written_as_in_toml_or_with_commas() {
     }
     assert!(refused(&["environment.training_tasks=[1"]).contains("must be a list, not \"[1\""));
     assert!(refused(&["environment.training_tasks=game-9"]).starts_with("environment.training_tasks: "));
+}
+
+/// A task that counts twice would be drawn twice as often, and a world of it be built twice.
+#[test]
+fn a_list_has_no_task_twice_whatever_it_is_called() {
+    let of = |task_set: &str, key: &str, names: &str| {
+        let text = format!("environment.task_set = {task_set:?}");
+        let setting = set(&format!("environment.{key}={names}")).unwrap();
+        resolve(&text, "test", &[setting]).map_err(|error| error.to_string())
+    };
+    for (task_set, key, first, second) in [
+        ("matrix-game", "training_tasks", "game-1", "game-1"),
+        ("3-8m", "training_tasks", "3m", "3m-vs-3m"),
+        ("3-8MMM", "testing_tasks", "1m2M", "2M1m"),
+    ] {
+        assert_eq!(
+            of(task_set, key, &format!("{first},{second}")).unwrap_err(),
+            format!("environment.{key} lists one task twice, as {first} and as {second}; leave one out")
+        );
+    }
+    // Another name for a task is understood, and so is a task that both lists have.
+    assert!(of("3-8m", "training_tasks", "3m-vs-3m,4m,3m-vs-4m").is_ok());
+    assert!(of("3-8m", "testing_tasks", "3m").is_ok());
+    for name in ["navigation-03-3", "navigation-+3-3"] {
+        let refused = of("cooperative-navigation", "training_tasks", name).unwrap_err();
+        let begins = format!("environment.training_tasks: unknown task {name:?}");
+        assert!(refused.starts_with(&begins), "{refused}");
+    }
 }
 
 #[test]

@@ -96,13 +96,17 @@ impl Team {
         let mut rest = name;
         while !rest.is_empty() {
             let digits = rest.bytes().take_while(u8::is_ascii_digit).count();
+            // `03m` would be another name of `3m`; there is no team of none.
+            if rest.starts_with('0') {
+                return Err(wrong());
+            }
             let count: u8 = rest[..digits].parse().map_err(|_| wrong())?;
             let letter = rest[digits..].chars().next().ok_or_else(wrong)?;
             let kind = UnitType::ALL.into_iter().find(|kind| kind.letter() == letter).ok_or_else(wrong)?;
             if !set.types().contains(&kind) {
                 return Err(TeamError::Type { name: name.to_owned(), letter, set });
             }
-            if count == 0 || team.count(kind) > 0 {
+            if team.count(kind) > 0 {
                 return Err(wrong());
             }
             team.0[kind as usize] = count;
@@ -285,7 +289,7 @@ mod tests {
             "2m1z has a unit of type 'z', which 3-8m does not have; it has m"
         );
         assert_eq!(refused("2v", CombatSet::MarinesMaraudersMedivacs), "2v has no unit that can attack");
-        for name in ["", "m", "3", "0m", "3m3m", "3x", "-3m", "300m", "3é"] {
+        for name in ["", "m", "3", "0m", "03m", "+3m", "3m3m", "3x", "-3m", "300m", "3é"] {
             assert!(Team::parse(name, CombatSet::Marines).is_err(), "{name}");
         }
     }

@@ -75,6 +75,10 @@ impl Environment for CooperativeNavigation {
         Ok(Step { reward: self.team_reward(), shaping: 0.0, end, won: false })
     }
 
+    fn is_over_at_limit(&self) -> bool {
+        self.world.is_over_at_limit()
+    }
+
     fn scene(&self) -> Option<Scene> {
         Some(self.world.scene())
     }

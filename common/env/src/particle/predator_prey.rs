@@ -140,6 +140,10 @@ impl Environment for PredatorPrey {
         Ok(Step { reward: self.team_reward(), shaping: self.approach_shaping * nearer, end, won: false })
     }
 
+    fn is_over_at_limit(&self) -> bool {
+        self.world.is_over_at_limit()
+    }
+
     fn scene(&self) -> Option<Scene> {
         Some(self.world.scene())
     }

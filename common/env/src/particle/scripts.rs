@@ -33,37 +33,66 @@ pub(crate) fn chase(turn: &mut Turn<'_>) {
     }
 }
 
-/// The landmark of each agent, no landmark twice, so that the sum of distances is least: the optimum, by
-/// dynamic programming over sets of landmarks. Agents beyond the number of landmarks get none.
+/// The landmark of each agent, no landmark twice, so that the sum of distances is least. Agents beyond the number of
+/// landmarks get none.
 fn nearest_assignment(agents: &[Vector], landmarks: &[Vector]) -> Vec<usize> {
     let placed = agents.len().min(landmarks.len());
-    // least[set]: the least cost at which the first |set| agents take exactly the landmarks of the set, and
-    // the landmark of the last of them.
-    let mut least = vec![(f32::INFINITY, 0); 1 << landmarks.len()];
-    least[0].0 = 0.0;
-    let mut best = 0;
-    for set in 0..least.len() {
-        let agent = set.count_ones() as usize;
-        if agent == placed && (best == 0 || least[set].0 < least[best].0) {
-            best = set;
-        }
-        if agent >= placed {
-            continue;
-        }
-        for (landmark, &position) in landmarks.iter().enumerate() {
-            let with = set | 1 << landmark;
-            let cost = least[set].0 + squared_distance(agents[agent], position).sqrt();
-            if with != set && cost < least[with].0 {
-                least[with] = (cost, landmark);
+    let distance = |agent: usize, landmark: usize| {
+        f64::from(squared_distance(agents[agent], landmarks[landmark]).sqrt())
+    };
+    least_assignment(placed, landmarks.len(), distance)
+}
+
+/// A column for each row, none twice, so that the sum of costs is least, for no more rows than columns: the Hungarian
+/// algorithm, in O(rows² · columns) time.
+///
+/// Every row and every column has a price. No cost is less than the prices of its row and column together, and the cost of
+/// an assigned pair is as much: so no other assignment costs less. Rows join one by one, each along the cheapest path
+/// from it over assigned pairs to a free column.
+fn least_assignment(rows: usize, columns: usize, cost: impl Fn(usize, usize) -> f64) -> Vec<usize> {
+    // One column more, where a row stands as long as it has no other.
+    let start = columns;
+    let mut row_of: Vec<Option<usize>> = vec![None; columns + 1];
+    let (mut row_prices, mut column_prices) = (vec![0.0; rows], vec![0.0; columns + 1]);
+    for joining in 0..rows {
+        row_of[start] = Some(joining);
+        // What a step to each column still costs beyond prices, from which column it comes, and which have been reached.
+        let (mut beyond, mut from) = (vec![f64::INFINITY; columns], vec![start; columns]);
+        let mut reached = vec![false; columns + 1];
+        let mut column = start;
+        while let Some(row) = row_of[column] {
+            reached[column] = true;
+            for next in (0..columns).filter(|&next| !reached[next]) {
+                let step = cost(row, next) - row_prices[row] - column_prices[next];
+                if step < beyond[next] {
+                    (beyond[next], from[next]) = (step, column);
+                }
             }
+            let unreached = (0..columns).filter(|&next| !reached[next]);
+            let Some(next) = unreached.min_by(|&a, &b| beyond[a].total_cmp(&beyond[b])) else { break };
+            let raise = beyond[next];
+            for column in 0..=columns {
+                if let Some(row) = row_of[column].filter(|_| reached[column]) {
+                    row_prices[row] += raise;
+                    column_prices[column] -= raise;
+                }
+            }
+            (0..columns).filter(|&next| !reached[next]).for_each(|next| beyond[next] -= raise);
+            column = next;
+        }
+        // Every row on the path moves one column on.
+        while column != start {
+            row_of[column] = row_of[from[column]];
+            column = from[column];
         }
     }
-    let mut assignment = vec![0; placed];
-    for landmark in assignment.iter_mut().rev() {
-        *landmark = least[best].1;
-        best &= !(1 << *landmark);
+    let mut column_of = vec![0; rows];
+    for (column, row) in row_of[..columns].iter().enumerate() {
+        if let Some(row) = *row {
+            column_of[row] = column;
+        }
     }
-    assignment
+    column_of
 }
 
 /// The action that brings the agent nearer to its target: along the longer axis of what will still be missing

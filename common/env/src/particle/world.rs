@@ -122,6 +122,11 @@ impl World {
         self.physics
     }
 
+    /// Whether [`World::advance`] calls an episode of full length over: nothing but time ends one.
+    pub(super) fn is_over_at_limit(&self) -> bool {
+        self.physics == Physics::Original
+    }
+
     pub(super) fn n_agents(&self) -> usize {
         self.n_agents
     }
@@ -163,10 +168,7 @@ impl World {
             integrate(body, self.physics);
         }
         self.step += 1;
-        let end = match self.physics {
-            Physics::Original => End::Terminated,
-            Physics::Mpe2 => End::Truncated,
-        };
+        let end = if self.is_over_at_limit() { End::Terminated } else { End::Truncated };
         (self.step >= STEPS).then_some(end)
     }
 

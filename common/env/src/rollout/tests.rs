@@ -73,23 +73,86 @@ fn an_end_at_the_time_limit_counts_as_what_is_asked_for() {
         (episode.end, episode.won)
     };
     let [asked, cut, over] = [TimeLimit::Environment, TimeLimit::Truncated, TimeLimit::Terminated];
-    // The matrix game calls its last step the end; a game that is won there stays so.
-    let game = |time_limit| end(rollout(1, true), &mut Fixed([0, 0]), time_limit);
-    assert_eq!(game(asked), (End::Terminated, false));
-    assert_eq!(game(cut), (End::Truncated, false));
-    assert_eq!(game(over), (End::Terminated, false));
+    // The matrix game itself ends on its last step, won or lost.
+    let lost = |time_limit| end(rollout(1, true), &mut Fixed([0, 0]), time_limit);
+    assert_eq!([asked, cut, over].map(lost), [(End::Terminated, false); 3]);
     let won = |time_limit| end(rollout(5, false), &mut Fixed([0, 2]), time_limit);
     assert_eq!([asked, cut, over].map(won), [(End::Terminated, true); 3]);
-    // Simple spread of mpe2 calls it a cut.
-    let spread = |time_limit| {
-        let options = EnvironmentOptions { physics: Physics::Mpe2, ..EnvironmentOptions::default() };
-        let tasks = TaskSet::CooperativeNavigation.tasks(Split::Training);
-        let rollout = Rollout::new(tasks, Arc::new(Embedded(options)), RunSeed(2), true);
-        end(rollout, &mut Script::Random, time_limit)
+    // Particle worlds end for want of time alone. The original calls that over, and simple spread of mpe2 a cut.
+    for set in [TaskSet::CooperativeNavigation, TaskSet::PredatorPrey, TaskSet::PredatorPreyPro] {
+        let particles = |physics, time_limit| {
+            let options = EnvironmentOptions { physics, ..EnvironmentOptions::default() };
+            let worlds = Arc::new(Embedded(options));
+            let rollout = Rollout::new(set.tasks(Split::Training), worlds, RunSeed(2), true);
+            end(rollout, &mut Script::Random, time_limit).0
+        };
+        let of = |physics| [asked, cut, over].map(|time_limit| particles(physics, time_limit));
+        assert_eq!(of(Physics::Original), [End::Terminated, End::Truncated, End::Terminated], "{set}");
+        assert_eq!(of(Physics::Mpe2), [End::Truncated, End::Truncated, End::Terminated], "{set}");
+    }
+}
+
+/// A battle whose last step ends it in this way.
+struct LastStep {
+    game: MatrixGame,
+    end: End,
+    won: bool,
+    is_over_at_limit: bool,
+}
+
+impl Environment for LastStep {
+    fn spec(&self) -> Spec {
+        MatrixGame::SPEC
+    }
+
+    fn reset(&mut self, rng: &mut Rng) -> Result<(), EnvironmentError> {
+        self.game.reset(rng)
+    }
+
+    fn observe(&self, observation: &mut Observation) {
+        self.game.observe(observation);
+    }
+
+    fn step(&mut self, actions: &[Action], rng: &mut Rng) -> Result<Step, EnvironmentError> {
+        let step = self.game.step(actions, rng)?;
+        Ok(Step { end: step.end.map(|_| self.end), won: self.won && step.end.is_some(), ..step })
+    }
+
+    fn is_over_at_limit(&self) -> bool {
+        self.is_over_at_limit
+    }
+}
+
+struct LastSteps(End, bool, bool);
+
+impl EnvironmentFactory for LastSteps {
+    fn build(&self, _: Task) -> Result<Box<dyn Environment>, EnvironmentError> {
+        let Self(end, won, is_over_at_limit) = *self;
+        Ok(Box::new(LastStep { game: MatrixGame::new(0), end, won, is_over_at_limit }))
+    }
+}
+
+/// As in combat: a battle that is lost on the very step on which time is up is over, not cut off.
+#[test]
+fn a_defeat_on_the_last_step_is_no_cut() {
+    let end = |world: LastSteps| {
+        let tasks = TaskSet::MatrixGame.tasks(Split::Training);
+        let rollout = Rollout::new(tasks, Arc::new(world), RunSeed(1), true);
+        let rolled = rollout.with_time_limit(TimeLimit::Truncated).roll(&mut Fixed([0, 0]), &jobs(0..1));
+        all_rolled(rolled).unwrap().remove(0).end
     };
+    assert_eq!(end(LastSteps(End::Terminated, false, false)), End::Terminated, "lost");
+    assert_eq!(end(LastSteps(End::Terminated, true, false)), End::Terminated, "won");
+    assert_eq!(end(LastSteps(End::Truncated, false, false)), End::Truncated, "time is up");
     assert_eq!(
-        [asked, cut, over].map(spread).map(|(end, _)| end),
-        [End::Truncated, End::Truncated, End::Terminated]
+        end(LastSteps(End::Terminated, false, true)),
+        End::Truncated,
+        "time is up, and the world calls that over"
+    );
+    assert_eq!(
+        end(LastSteps(End::Terminated, true, true)),
+        End::Terminated,
+        "won, whatever else it calls over"
     );
 }
 

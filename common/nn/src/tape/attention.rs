@@ -1,9 +1,9 @@
 //! Grouped attention on the tape, in its three parts: methods that look at the same entities through several masks make
 //! queries, keys and values once.
 
-use super::{Backward, Gradient, Tape, Values, Var};
+use super::{Backward, Gradient, Gradients, Tape, Values, Var};
 use crate::{
-    Accum, Attention, ViewMut,
+    Accum, Attention, Buffer, ViewMut,
     attention::{self, Group, KeysMut, Sides, SidesMut, Visible},
     linear, matmul,
 };
@@ -116,29 +116,70 @@ impl Over<'_> {
         let mut d_queries = back.gradients.work.take(self.queries.len());
         let queries = ViewMut::dense(&mut d_queries, self.queries.cols);
         let (sides, gradients) = (self.sides(&back.values), &mut back.gradients);
-        // Where several keys stand for one row, none of them may write over the others.
-        let mut begin = |x| if self.rows.is_some() { gradients.begin_adding(x) } else { gradients.begin(x) };
-        let adds = |gradient: &Gradient| gradient.accum == Accum::Add;
         match self.keys.beside(self.values) {
             Some(both) => {
-                let Some(mut d) = begin(both) else { return };
-                let adds = [adds(&d); 2];
+                let mut d = Contribution::begin(gradients, both, self.rows.is_some());
+                let adds = [d.adds(); 2];
                 let keys = KeysMut::Together(d.view_mut());
                 attention::backward(sides, groups, weights, d_out.view(), SidesMut { queries, keys, adds });
-                back.gradients.end(d);
+                d.end(gradients);
             }
             None => {
-                let (Some(mut d_keys), Some(mut d_values)) = (begin(self.keys), begin(self.values)) else {
-                    return;
-                };
-                let adds = [adds(&d_keys), adds(&d_values)];
+                let [mut d_keys, mut d_values] = [self.keys, self.values]
+                    .map(|side| Contribution::begin(gradients, side, self.rows.is_some()));
+                let adds = [d_keys.adds(), d_values.adds()];
                 let keys = KeysMut::Apart(d_keys.view_mut(), d_values.view_mut());
                 attention::backward(sides, groups, weights, d_out.view(), SidesMut { queries, keys, adds });
-                back.gradients.end(d_keys);
-                back.gradients.end(d_values);
+                d_keys.end(gradients);
+                d_values.end(gradients);
             }
         }
         back.gradients.contribute(self.queries, d_queries);
+    }
+}
+
+/// Where the kernel writes the gradient by keys or values, which it makes together with that by the queries.
+enum Contribution {
+    /// To the gradient.
+    Wanted(Gradient),
+    /// Where keys or values are constant, to memory that is not read.
+    Unwanted {
+        /// Dense.
+        buffer: Buffer,
+        /// Its columns.
+        cols: usize,
+    },
+}
+
+impl Contribution {
+    /// Begins one; `shared` where several keys stand for one row: none of them may then write over the others.
+    fn begin(gradients: &mut Gradients, x: Var, shared: bool) -> Self {
+        let begun = if shared { gradients.begin_adding(x) } else { gradients.begin(x) };
+        begun.map_or_else(
+            || Self::Unwanted { buffer: gradients.work.take_zeros(x.len()), cols: x.cols },
+            Self::Wanted,
+        )
+    }
+
+    fn adds(&self) -> bool {
+        match self {
+            Self::Wanted(gradient) => gradient.accum == Accum::Add,
+            Self::Unwanted { .. } => true,
+        }
+    }
+
+    fn view_mut(&mut self) -> ViewMut<'_> {
+        match self {
+            Self::Wanted(gradient) => gradient.view_mut(),
+            Self::Unwanted { buffer, cols } => ViewMut::dense(buffer, *cols),
+        }
+    }
+
+    fn end(self, gradients: &mut Gradients) {
+        match self {
+            Self::Wanted(gradient) => gradients.end(gradient),
+            Self::Unwanted { buffer, .. } => gradients.work.give(buffer),
+        }
     }
 }
 
@@ -146,7 +187,7 @@ impl Over<'_> {
 mod tests {
     use super::Over;
     use crate::{
-        Attention, LayoutBuilder, Linear, Tape, Var,
+        Attention, LayoutBuilder, Linear, Tape, Var, View,
         attention::{Group, Visible},
         gradcheck::{check_operation, noise, run_operation},
     };
@@ -178,6 +219,38 @@ mod tests {
             tape.attend_into(&attention, queries, key_values, &groups, &all, out);
             out
         });
+    }
+
+    /// Queries learn from keys and values that are constant, both or one of them, side by side or apart.
+    #[test]
+    fn constant_keys_and_values_pass_the_queries_gradient() {
+        let mut layout = LayoutBuilder::default();
+        let queries = Linear::new(&mut layout, "queries", 3, 4);
+        let groups: &'static [Group] =
+            vec![Group { queries: 0..2, keys: 0..3 }, Group { queries: 2..3, keys: 3..5 }].leak();
+        let rows: &'static [usize] = vec![1, 0, 1, 1, 2].leak();
+        let fixed: &'static [f32] = noise(7, 5 * 8).leak();
+        let both = View::dense(fixed, 8);
+        let attend = |tape: &mut Tape<'static>, x: Var, keys: Var, values: Var, rows| {
+            let over = Over { queries: tape.linear(&queries, x), keys, values, rows, heads: 2, head_dim: 2 };
+            let out = tape.reserve(3, 4);
+            tape.attend_over(over, groups, &[Visible::All], out);
+            out
+        };
+        for rows in [None, Some(rows)] {
+            check_operation(layout.len(), &[(3, 3)], |tape, x| {
+                let both = tape.constant(both);
+                attend(tape, x[0], both.columns(0..4), both.columns(4..8), rows)
+            });
+            check_operation(layout.len(), &[(3, 3), (5, 4)], |tape, x| {
+                let keys = tape.constant(both.columns(0..4));
+                attend(tape, x[0], keys, x[1], rows)
+            });
+            check_operation(layout.len(), &[(3, 3), (5, 4)], |tape, x| {
+                let values = tape.constant(both.columns(4..8));
+                attend(tape, x[0], x[1], values, rows)
+            });
+        }
     }
 
     /// Keys that all heads share, and rows that several keys stand for: two groups' keys 0, 2 and 3 are one entity.

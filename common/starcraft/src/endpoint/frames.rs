@@ -96,7 +96,7 @@ impl Frames {
                     continue;
                 }
                 (OpCode::Control(Control::Close), _) => {
-                    // A client that says goodbye may be gone before the answer.
+                    // A client that closes its connection may be gone before the answer.
                     let _ = self.0.send(Frame::close(None));
                     return Ok(None);
                 }

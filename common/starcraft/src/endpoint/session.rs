@@ -189,7 +189,7 @@ impl Session {
 
     fn join(&mut self, join: &RequestJoinGame) -> Result<Body, Refusal> {
         if self.status != Status::InitGame {
-            return Err("no game waits for somebody to join: create one first".into());
+            return Err("no game waits for a client to join: create one first".into());
         }
         let refused = |error: response_join_game::Error, details: &str| {
             let (error, error_details) = (Some(error.into()), Some(details.to_owned()));

@@ -116,21 +116,68 @@ fn assigns_by_the_least_total_distance() {
     assert_eq!(nearest_assignment(&three, &[[8.0, 0.0]]), [0]);
     assert_eq!(nearest_assignment(&three, &[]), [0; 0]);
 
+    // As many agents as landmarks, fewer and more: the least of all that there are.
     let mut rng = RunSeed(0).stream(Stream::Environment, 0);
-    for n in 1..=5 {
-        let mut places = || -> Vec<Vector> {
-            let place = |_| [rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0)];
-            (0..n).map(place).collect()
-        };
-        let (agents, landmarks) = (places(), places());
+    for (n, m) in (1..=5).flat_map(|n| (1..=5).map(move |m| (n, m))) {
+        let (agents, landmarks) = (places(n, &mut rng), places(m, &mut rng));
+        let placed = n.min(m);
         let cost = |assignment: &[usize]| -> f32 {
             let pairs = agents.iter().zip(assignment);
             pairs.map(|(&agent, &landmark)| squared_distance(agent, landmarks[landmark]).sqrt()).sum()
         };
-        let least = permutations(n).iter().map(|assignment| cost(assignment)).fold(f32::INFINITY, f32::min);
-        let found = cost(&nearest_assignment(&agents, &landmarks));
-        assert!((found - least).abs() < 1e-5, "{n}: {found} {least}");
+        let all = permutations(m);
+        let least = all.iter().map(|all| cost(&all[..placed])).fold(f32::INFINITY, f32::min);
+        let assignment = nearest_assignment(&agents, &landmarks);
+        assert_eq!(assignment.len(), placed, "{n} agents, {m} landmarks");
+        let mut taken = assignment.clone();
+        taken.sort_unstable();
+        taken.dedup();
+        assert_eq!(taken.len(), placed, "{n} agents, {m} landmarks: {assignment:?}");
+        let found = cost(&assignment);
+        assert!((found - least).abs() < 1e-5, "{n} agents, {m} landmarks: {found} {least}");
     }
+}
+
+fn places(n: usize, rng: &mut rit_episode::Rng) -> Vec<Vector> {
+    (0..n).map(|_| [rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0)]).collect()
+}
+
+/// The largest tasks that have a name: sets of landmarks can no longer be listed, but what is least is known.
+#[test]
+fn assigns_as_many_as_a_task_may_have() {
+    let mut rng = RunSeed(1).stream(Stream::Environment, 0);
+    let agents = places(64, &mut rng);
+    // Landmarks where the agents are, in another order.
+    let elsewhere: Vec<usize> = (0..64).map(|agent| (agent * 23 + 5) % 64).collect();
+    let mut landmarks = vec![[0.0; 2]; 64];
+    for (&place, &landmark) in agents.iter().zip(&elsewhere) {
+        landmarks[landmark] = place;
+    }
+    assert_eq!(nearest_assignment(&agents, &landmarks), elsewhere);
+    // On a line the first goes to the first, the second to the second, and so on.
+    let on_a_line =
+        |places: Vec<Vector>| -> Vec<Vector> { places.into_iter().map(|[x, _]| [x, 0.0]).collect() };
+    let (agents, landmarks) = (on_a_line(places(64, &mut rng)), on_a_line(places(64, &mut rng)));
+    let sorted = |places: &[Vector]| {
+        let mut sorted: Vec<f32> = places.iter().map(|place| place[0]).collect();
+        sorted.sort_by(f32::total_cmp);
+        sorted
+    };
+    let pairs = sorted(&agents).into_iter().zip(sorted(&landmarks));
+    let least: f32 = pairs.map(|(agent, landmark)| (agent - landmark).abs()).sum();
+    let assignment = nearest_assignment(&agents, &landmarks);
+    let pairs = agents.iter().zip(assignment);
+    let found: f32 = pairs.map(|(agent, landmark)| (agent[0] - landmarks[landmark][0]).abs()).sum();
+    assert!((found - least).abs() < 1e-4, "{found} {least}");
+    // And one step of the script in such a task.
+    let task = TaskSet::CooperativeNavigation.task("navigation-40-40").unwrap();
+    let mut world = task.environment(crate::EnvironmentOptions::default());
+    world.reset(&mut rng).unwrap();
+    let spec = world.spec();
+    let mut seen = Observation::new(spec.n_agents, spec.n_entities, spec.feature_dim, spec.n_actions);
+    world.observe(&mut seen);
+    let actions = act(Script::NearestAssignment, &seen);
+    assert!(actions.len() == 40 && actions.iter().any(|&action| action != 0));
 }
 
 fn permutations(n: usize) -> Vec<Vec<usize>> {
@@ -162,8 +209,8 @@ fn chases_the_one_prey_that_is_nearest_to_any_predator() {
         [0.0, 0.0],
     );
     assert_eq!(act(Script::Chase, &seen), [2, 2]);
-    let nobody = observation(&[(Agent, [0.0, 0.0])], [0.0, 0.0]);
-    assert_eq!(act(Script::Chase, &nobody), [0]);
+    let without_prey = observation(&[(Agent, [0.0, 0.0])], [0.0, 0.0]);
+    assert_eq!(act(Script::Chase, &without_prey), [0]);
 }
 
 #[test]
