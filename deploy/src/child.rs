@@ -42,7 +42,7 @@ pub fn take_name() {
 /// When the system refuses.
 pub fn spawn(mut command: Command, log: &Path, lock: Option<BorrowedFd<'_>>) -> io::Result<Child> {
     if let Some(folder) = log.parent() {
-        // Somebody may have removed it since the run began. Where the whole run directory is gone, none is made in its
+        // It may have been removed since the run began. Where the whole run directory is gone, none is made in its
         // place.
         match DirBuilder::new().mode(0o700).create(folder) {
             Err(error) if error.kind() != ErrorKind::AlreadyExists => {

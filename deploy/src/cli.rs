@@ -54,7 +54,7 @@ pub enum Command {
     Ctl(CtlOptions),
     /// Watch a run in the terminal; q or Ctrl-C ends the view, not the run
     Watch(WatchOptions),
-    /// Kill a run's processes at random moments, and hold its end to that of an undisturbed run; or simulate that
+    /// Kill a run's processes at random moments, and compare its end with an undisturbed run's; or simulate that
     Soak(SoakOptions),
     /// Measure a part beside the machine's limit
     Bench(BenchOptions),
@@ -251,7 +251,7 @@ pub struct CertificatesOptions {
 
 #[derive(Debug, Subcommand)]
 pub enum EnvCommand {
-    /// Hold environments to what they promise: random episodes, each again, and what is wrong in words
+    /// Check that environments keep the interface's rules: plays random episodes, each twice, and says what is wrong
     Check(EnvCheckOptions),
 }
 
@@ -280,7 +280,8 @@ pub struct EnvCheckOptions {
 /// Who plays, and what.
 #[derive(Args, Debug)]
 pub struct PlayOptions {
-    /// checkpoint: a run's newest weights. script:NAME: random, still, nearest-assignment or chase
+    /// checkpoint: a run's newest weights. script:NAME: random, still, nearest-assignment or chase; in combat nearest, focus or
+    /// kite
     #[arg(long, default_value = "checkpoint")]
     pub policy: String,
     /// Run directory

@@ -1,15 +1,20 @@
 //! `rit report`: the experimental section of a paper, from runs that are over.
 
 use crate::{cli::ReportOptions, experiments::plain_settings, failure::Failure, output, representations};
-use rit_report::{Measure, Options, Report, ReportError, finished, read, report};
+use rit_config::open_regular;
+use rit_report::{GENERATOR, Measure, Options, Report, ReportError, finished, read, report};
 use std::{
-    fs, io,
+    fs::{self, OpenOptions},
+    io::{self, Read as _},
     path::{Path, PathBuf},
     process::ExitCode,
 };
 
 /// What a report's folder holds, and nothing else.
-const ENTRIES: [&str; 5] = ["index.html", "marl-eval.json", "runs.csv", "figures", "tables"];
+const ENTRIES: [&str; 5] = [PAGE, "marl-eval.json", "runs.csv", "figures", "tables"];
+const PAGE: &str = "index.html";
+/// Where in the page its generator is named: well within so many bytes.
+const HEAD_BYTES: u64 = 4096;
 /// What of it is large, and in the page or in the records already.
 const DATA: [&str; 3] = ["marl-eval.json", "runs.csv", "figures"];
 
@@ -68,10 +73,26 @@ fn check(out: &Path, force: bool) -> Result<(), Failure> {
                     out.display(),
                     other.to_string_lossy()
                 ))),
+                None if !force && !names.is_empty() && !is_report(out) => {
+                    Err(Failure::input_message(format!(
+                        "--out {} holds {}, and no {PAGE} that names `rit report` as its generator; choose another folder, or \
+                         --force replaces what lies there under a report's names",
+                        out.display(),
+                        names[0].to_string_lossy()
+                    )))
+                }
                 _ => Ok(()),
             }
         }
     }
+}
+
+/// Whether the page there says what made it: other programs too make folders of figures and tables.
+fn is_report(out: &Path) -> bool {
+    let mut head = Vec::new();
+    let page = open_regular(&out.join(PAGE), OpenOptions::new().read(true));
+    page.and_then(|page| page.take(HEAD_BYTES).read_to_end(&mut head)).is_ok()
+        && String::from_utf8_lossy(&head).contains(GENERATOR)
 }
 
 /// Writes all of it beside its place, then moves it there part by part: an earlier report's figures do not stay.
@@ -109,5 +130,30 @@ impl From<ReportError> for Failure {
             ReportError::Draw(_) | ReportError::Write(_) => Self::runtime(error),
             _ => Self::input(error),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn figures_and_tables_that_no_report_made_are_not_replaced() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path();
+        check(out, false).unwrap();
+        check(&out.join("new"), false).unwrap();
+        for entry in ["figures", "tables"] {
+            fs::create_dir(out.join(entry)).unwrap();
+        }
+        let refused = |out: &Path| check(out, false).unwrap_err().to_string();
+        assert!(refused(out).contains("no index.html that names `rit report`"), "{}", refused(out));
+        check(out, true).unwrap();
+        fs::write(out.join(PAGE), "<!doctype html>\n<title>mine</title>\n").unwrap();
+        assert!(refused(out).contains("choose another folder"), "{}", refused(out));
+        fs::write(out.join(PAGE), rit_report::page("Comparison of runs", &[], None)).unwrap();
+        check(out, false).unwrap();
+        fs::write(out.join("thesis.tex"), "").unwrap();
+        assert!(refused(out).contains("something else than a report: thesis.tex"), "{}", refused(out));
     }
 }

@@ -41,11 +41,11 @@ pub async fn connect(run_dir: &RunDir) -> Result<ControlClient<Client>, Failure>
     })
 }
 
-/// Why there is no answer.
+/// Why the learner cannot be used.
 enum Silence {
-    /// No answer comes.
+    /// No learner answers.
     Absent(Failure),
-    /// Somebody is.
+    /// A learner answers and refuses, or another program listens there.
     Other(Failure),
 }
 

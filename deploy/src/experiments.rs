@@ -2,7 +2,7 @@
 
 use crate::{cli::ConfigOptions, failure::Failure, output, python_worlds};
 use rit_algo::Method;
-use rit_config::{Config, in_program_words, read_text, resolve, set};
+use rit_config::{Config, in_program_words, read_text, resolve, set, set_all};
 use std::{collections::BTreeMap, path::Path, process::ExitCode};
 use toml::Table;
 
@@ -96,7 +96,7 @@ fn with_worlds(text: &str, source_name: &str, mut settings: Vec<Table>) -> Resul
 /// # Errors
 /// When one is no assignment.
 pub fn parse_settings(settings: &[String]) -> Result<Vec<Table>, Failure> {
-    Ok(settings.iter().map(|text| set(text)).collect::<Result<_, _>>()?)
+    Ok(set_all(settings)?)
 }
 
 /// Every setting of a run of the experiment that is called as its task set, with this method and nothing else set: what

@@ -47,7 +47,8 @@ impl Finished {
         }
         let finished = Self::read(run_dir)?;
         let newest = fs::read_link(run_dir.checkpoints().join(LATEST)).ok();
-        let trained = newest.and_then(|newest| newest.to_str()?.rsplit('-').next()?.parse::<u64>().ok());
+        // The steps, which a number follows where there are several at that step.
+        let trained = newest.and_then(|newest| newest.to_str()?.split('-').nth(1)?.parse::<u64>().ok());
         Ok((trained.unwrap_or(0) <= finished.summary.progress.env_steps).then_some(finished))
     }
 
@@ -148,5 +149,36 @@ impl Metrics {
             }
         }
         Ok(None)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::experiments;
+    use rit_config::OwnedRunDir;
+    use rit_record::Progress;
+    use std::os::unix::fs::symlink;
+
+    #[test]
+    fn a_run_that_was_trained_after_its_summary_is_not_over() {
+        let folder = tempfile::tempdir().unwrap();
+        let config = experiments::load("matrix-game", &[]).unwrap().config;
+        let owned = OwnedRunDir::create(&folder.path().join("run"), &config).unwrap();
+        let run_dir = owned.run_dir();
+        let progress = Progress { env_steps: 400, ..Progress::default() };
+        Summary { progress, ..Summary::default() }.write(run_dir).unwrap();
+        fs::create_dir_all(run_dir.checkpoints()).unwrap();
+        let latest = run_dir.checkpoints().join(LATEST);
+        for (newest, is_over) in [
+            ("step-000000000400", true),
+            ("step-000000000400-2", true),
+            ("step-000000000800", false),
+            ("step-000000000800-2", false),
+        ] {
+            symlink(newest, &latest).unwrap();
+            assert_eq!(Finished::of(run_dir).unwrap().is_some(), is_over, "{newest}");
+            fs::remove_file(&latest).unwrap();
+        }
     }
 }

@@ -41,7 +41,7 @@ fn in_text(text: &str) -> String {
     }
     match last(&|line| !matches!(level(line), Some("INFO" | "DEBUG" | "TRACE"))) {
         Some(at) => message(lines[at]),
-        None => "it said nothing of it".to_owned(),
+        None => "its log gives no reason".to_owned(),
     }
 }
 
@@ -92,9 +92,9 @@ mod tests {
                     .to_owned(),
                 "no: full",
             ),
-            (format!("Killed by somebody\n{INFO}\n"), "Killed by somebody"),
-            (format!("{INFO}\n{INFO}\n"), "it said nothing of it"),
-            (String::new(), "it said nothing of it"),
+            (format!("Killed by the kernel\n{INFO}\n"), "Killed by the kernel"),
+            (format!("{INFO}\n{INFO}\n"), "its log gives no reason"),
+            (String::new(), "its log gives no reason"),
         ] {
             assert_eq!(in_text(&text), words, "{text}");
         }
@@ -107,7 +107,7 @@ mod tests {
         log.write_all(before.as_bytes()).unwrap();
         let begins_at = before.len() as u64;
         assert_eq!(last_words(log.path(), 0), "of a former life");
-        assert_eq!(last_words(log.path(), begins_at), "it said nothing of it");
+        assert_eq!(last_words(log.path(), begins_at), "its log gives no reason");
         // Not UTF-8, and longer than what is looked through.
         log.write_all(&vec![0xff; 200_000]).unwrap();
         log.write_all(b"\nerror: of this one\n").unwrap();

@@ -16,17 +16,19 @@ use tracing_subscriber::{EnvFilter, fmt, fmt::writer::BoxMakeWriter, reload};
 const LEVELS: [&str; 6] = ["error", "warn", "info", "debug", "trace", "off"];
 
 /// The parts of this program that log.
-const PARTS: [&str; 10] = [
+const PARTS: [&str; 12] = [
     "rit",
     "rit_actor",
     "rit_algo",
     "rit_config",
     "rit_env",
     "rit_episode",
+    "rit_foreign",
     "rit_ipc",
     "rit_learner",
     "rit_nn",
     "rit_proto",
+    "rit_starcraft",
 ];
 
 /// What the command line says of logs.
@@ -149,6 +151,27 @@ fn filter(text: &str) -> Result<EnvFilter, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::{fs, path::PathBuf};
+
+    #[test]
+    fn every_crate_that_logs_can_be_named_in_a_filter() {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+        let mut folders: Vec<PathBuf> =
+            ["actor", "deploy", "learner", "proto"].map(|name| root.join(name)).into();
+        folders.extend(fs::read_dir(root.join("common")).unwrap().map(|entry| entry.unwrap().path()));
+        let mut logging = Vec::new();
+        for manifest in folders.iter().filter_map(|folder| fs::read_to_string(folder.join("Cargo.toml")).ok())
+        {
+            if manifest.lines().any(|line| line.starts_with("tracing.") || line.starts_with("tracing =")) {
+                let name = manifest.lines().find_map(|line| line.strip_prefix("name = ")).unwrap();
+                logging.push(name.trim_matches('"').replace('-', "_"));
+            }
+        }
+        assert!(logging.len() >= 7, "{logging:?}");
+        for name in logging {
+            assert!(filter(&format!("{name}=debug")).is_ok(), "{name} logs, and PARTS lacks it");
+        }
+    }
 
     #[test]
     fn a_filter_means_something_or_is_refused_with_what_there_is() {

@@ -19,7 +19,7 @@ pub enum Reader {
 /// Prints a command's result on standard output, as it is.
 ///
 /// # Errors
-/// When somebody would read it and it cannot be written, as on a full disk.
+/// When it cannot be written, as on a full disk. A reader that has gone is no error.
 pub fn print(text: &str) -> Result<Reader, Failure> {
     let mut stdout = io::stdout().lock();
     match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
@@ -32,7 +32,7 @@ pub fn print(text: &str) -> Result<Reader, Failure> {
 /// Says something beside a command's result, as a line on standard error, in the words of the program that runs.
 ///
 /// # Errors
-/// When it cannot be written. Mostly that is to be ignored: who would be told?
+/// When it cannot be written. Mostly that is to be ignored: there is no other place to say it.
 pub fn say(line: &str) -> io::Result<()> {
     // In one piece, so that lines of several processes on one terminal do not mix.
     io::stderr().lock().write_all(format!("{}\n", in_program_words(line)).as_bytes())

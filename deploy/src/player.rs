@@ -79,7 +79,7 @@ impl Player {
     /// What these options ask for.
     ///
     /// # Errors
-    /// When something is missing, unknown, or does not go together.
+    /// When something is missing or unknown, or options do not fit each other.
     pub fn new(options: &PlayOptions) -> Result<Self, Failure> {
         let player = Self::of_policy(options)?;
         if let Some(notice) = rit_worlds::check(&player.config).map_err(Failure::input)? {
@@ -158,7 +158,7 @@ fn with_backend(config: Config, options: &PlayOptions) -> Result<Config, Failure
         Some("starcraft") => Backend::Starcraft,
         Some(other) => {
             return Err(Failure::input_message(format!(
-                "--backend {other:?} is none of its choices: embedded, starcraft"
+                "--backend {other:?} is not one of: embedded, starcraft"
             )));
         }
     };

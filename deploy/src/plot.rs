@@ -54,7 +54,7 @@ pub fn run(options: &PlotOptions) -> Result<ExitCode, Failure> {
         groups.iter().map(chart).collect()
     };
     let charts: Vec<Chart> = charts.into_iter().map(|chart| with_options(chart, options)).collect();
-    new_file::write(&options.out, chart::curves(&charts)?.as_bytes(), options.force)?;
+    new_file::write("--out", &options.out, chart::curves(&charts)?.as_bytes(), options.force)?;
     Ok(ExitCode::SUCCESS)
 }
 

@@ -6,11 +6,14 @@ use crate::{
     experiments,
     failure::Failure,
     logging::LogOptions,
-    shutdown,
+    shutdown, train,
 };
 use rit_actor::Learner;
 use rit_config::{OwnedRunDir, RunDir};
-use std::process::ExitCode;
+use std::{
+    process::ExitCode,
+    sync::atomic::{AtomicBool, Ordering},
+};
 use tracing::Instrument as _;
 
 /// `rit learner`.
@@ -26,7 +29,13 @@ pub async fn learner(options: LearnerOptions, logs: LogOptions) -> Result<ExitCo
         None => OwnedRunDir::open(&options.run_dir, options.supervised)?,
     };
     owned.notices().iter().for_each(|notice| tracing::warn!("{notice}"));
-    let shutdown = shutdown::requested(options.supervised);
+    let requested = shutdown::requested(options.supervised);
+    // A learner waits for a request to end from the moment on that its run goes.
+    let begun = AtomicBool::new(false);
+    let shutdown = async {
+        begun.store(true, Ordering::Relaxed);
+        requested.await;
+    };
     let run_dir = owned.run_dir().clone();
     let ended = match rit_worlds::check(&config).map_err(Failure::input) {
         Ok(notice) => {
@@ -43,15 +52,23 @@ pub async fn learner(options: LearnerOptions, logs: LogOptions) -> Result<ExitCo
             tracing::info!(digest, env_steps, ended = %summary.ended, "the run is over");
             return Ok(ExitCode::from(summary.ended.exit_code()));
         }
-        // For people, what they gave it does not fit what is there.
-        Err(Failure::Unavailable(error)) if !options.supervised => Failure::Input(error),
-        Err(failure) => failure,
+        Err(failure) if options.supervised => failure,
+        Err(failure) => for_people(failure, begun.load(Ordering::Relaxed)),
     };
     if matches!(failed, Failure::Input(_)) && !options.supervised {
-        // The same command will do for the next attempt.
-        owned.undo()?;
+        train::undo(owned);
     }
     Err(failed)
+}
+
+/// What a failure of a learner without a supervisor means: before its run has begun, that what was given does not fit what
+/// is there; later the run itself has failed, and what it has in its directory stays.
+fn for_people(failure: Failure, begun: bool) -> Failure {
+    match failure {
+        Failure::Unavailable(error) | Failure::Input(error) if begun => Failure::Runtime(error),
+        Failure::Unavailable(error) => Failure::Input(error),
+        failure => failure,
+    }
 }
 
 /// `rit actor`.
@@ -69,4 +86,23 @@ pub async fn actor(options: ActorOptions, logs: LogOptions) -> Result<ExitCode, 
         rit_actor::ActorOptions { name: options.name, slot: options.slot, supervised: options.supervised };
     rit_actor::run(learner, options, shutdown).instrument(span).await?;
     Ok(ExitCode::SUCCESS)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_what_fails_before_a_run_has_begun_is_wrong_input() {
+        let kinds = || {
+            let error = || anyhow::anyhow!("/dev/shm is full");
+            [Failure::Unavailable(error()), Failure::Input(error()), Failure::Runtime(error())]
+        };
+        let [unavailable, input, runtime] = kinds().map(|failure| for_people(failure, false));
+        assert!(matches!(unavailable, Failure::Input(_)) && matches!(input, Failure::Input(_)));
+        assert!(matches!(runtime, Failure::Runtime(_)));
+        for failure in kinds() {
+            assert!(matches!(for_people(failure, true), Failure::Runtime(_)));
+        }
+    }
 }

@@ -17,7 +17,7 @@ use std::{
 /// Off a terminal, a line is printed this often instead.
 pub const PLAIN_EVERY: Duration = Duration::from_secs(10);
 
-/// What may wait for somebody to read it; what comes beyond is in the log alone.
+/// Lines that may wait to be written; what comes beyond is in the log alone.
 pub const WAITING_MAX: usize = 256;
 
 /// How long the end of a run waits for what was said to be written.

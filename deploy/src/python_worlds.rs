@@ -68,7 +68,7 @@ pub fn check(options: &EnvCheckOptions) -> Result<ExitCode, Failure> {
         let checked =
             rit_foreign::check(worlds.as_ref(), task, options.episodes.into()).map_err(|broken| {
                 let _ = broken.traceback.as_ref().map(|traceback| output::say(&marked(traceback)));
-                Failure::runtime_message(format!("a promise is broken: {broken}"))
+                Failure::runtime_message(format!("the environment breaks a rule: {broken}"))
             })?;
         if !options.json {
             output::print(&in_words(&checked, options.episodes))?;

@@ -6,7 +6,7 @@ use std::{
     fmt::Write as _,
 };
 
-/// Tasks that are listed one by one where nobody has asked for them.
+/// Tasks that are listed one by one where no option asks for all.
 pub const TASKS_MAX: usize = 10;
 /// Of more, so many of the lowest and of the highest are.
 const ENDS: usize = 3;

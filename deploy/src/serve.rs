@@ -1,10 +1,13 @@
 //! `rit serve`: a folder of runs or a sweep in a browser of this machine. Each request looks for what has changed, so a
 //! sweep that still runs fills up as one looks; runs whose files have not changed are not read again.
 
+mod address;
+
 use crate::{
     cli::ServeOptions, experiments::plain_settings, failure::Failure, output, player::Trained, render,
     shutdown,
 };
+use address::RUNS;
 use axum::{
     Router,
     extract::{Path as UrlPath, Query, State},
@@ -34,11 +37,12 @@ use std::{
     path::{Path, PathBuf},
     process::ExitCode,
     sync::{Arc, Mutex, PoisonError},
-    time::SystemTime,
+    time::{Duration, SystemTime},
 };
+use tokio::sync::oneshot;
 
-/// Where browsers that are let in are led.
-const RUNS: &str = "/runs";
+/// How long open connections are waited for once it is to end; browsers hold idle ones.
+const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 /// Bytes of the token, and of the cookie's name.
 const TOKEN_BYTES: usize = 16;
 const NAME_BYTES: usize = 4;
@@ -71,6 +75,8 @@ pub async fn run(options: ServeOptions) -> Result<ExitCode, Failure> {
     let door = Door::bind(address)
         .await
         .map_err(|error| Failure::input_message(format!("--listen {address}: {error}")))?;
+    // Caught before it says where it listens.
+    let requested = shutdown::requested(false);
     output::print(&format!("web page: http://{}/?token={token}\n", door.address()))?;
     let routes = Router::new()
         .route(RUNS, get(all))
@@ -79,7 +85,17 @@ pub async fn run(options: ServeOptions) -> Result<ExitCode, Failure> {
         .route("/runs/{run}/{task}/{number}/episode.gif", get(film))
         .route("/page.css", get(|| async { ([(header::CONTENT_TYPE, "text/css; charset=utf-8")], CSS) }))
         .with_state(Arc::new(shown));
-    door.serve(guarded(Gate::new(&token, name, Home::Path(RUNS)), routes), shutdown::requested(false)).await;
+    let (end, ended) = oneshot::channel();
+    let closing = async move {
+        requested.await;
+        drop::<oneshot::Sender<()>>(end);
+        tokio::time::sleep(CLOSE_TIMEOUT).await;
+    };
+    let routes = guarded(Gate::new(&token, name, Home::Path(RUNS)), routes);
+    tokio::select! {
+        () = door.serve(routes, async { drop(ended.await) }) => {}
+        () = closing => {}
+    }
     Ok(ExitCode::SUCCESS)
 }
 
@@ -101,9 +117,16 @@ impl Shown {
         Ok(record)
     }
 
-    /// The run of this number, in the order in which they are found.
-    fn run(&self, number: usize) -> Result<Record, Wrong> {
-        self.read()?.runs.into_iter().nth(number).ok_or(Wrong::NotFound)
+    /// The run of this name: one of those that are found, so an address leads nowhere else.
+    fn run(&self, name: &str) -> Result<Record, Wrong> {
+        self.read()?.runs.into_iter().find(|run| self.name(run) == name).ok_or(Wrong::NotFound)
+    }
+
+    /// The run of this name if it has such a task, and the number after this one: the last number has none, and no episode.
+    fn episode(&self, name: &str, task: &str, number: u64) -> Result<(Record, u64), Wrong> {
+        let run = self.run(name)?;
+        let next = number.checked_add(1).filter(|_| tasks(&run).contains(task));
+        next.map(|next| (run, next)).ok_or(Wrong::NotFound)
     }
 
     fn name(&self, run: &Record) -> String {
@@ -184,7 +207,7 @@ async fn all(
         let input = shown.read()?;
         let mut runs = Section::new("runs", "Runs");
         runs.text.extend(input.sweeps.iter().map(SweepState::words));
-        let links = (0..input.runs.len()).map(|at| format!("{RUNS}/{at}")).collect();
+        let links = input.runs.iter().map(|run| address::run(&shown.name(run))).collect();
         runs.tables.push(Table { links, ..table(&shown, &input.runs) });
         let curves = curves(&shown, input, measured.measure.as_deref())?;
         Ok(html(&format!("Runs in {}", shown.folder.display()), &[curves, runs]))
@@ -311,13 +334,9 @@ fn table(shown: &Shown, runs: &[Record]) -> Table {
     }
 }
 
-async fn one(
-    State(shown): State<Arc<Shown>>,
-    UrlPath(number): UrlPath<usize>,
-) -> Result<Html<String>, Wrong> {
+async fn one(State(shown): State<Arc<Shown>>, UrlPath(name): UrlPath<String>) -> Result<Html<String>, Wrong> {
     apart(move || {
-        let run = shown.run(number)?;
-        let name = shown.name(&run);
+        let run = shown.run(&name)?;
         let mut facts = Section::new("run", "The run");
         facts.tables.push(table(&shown, std::slice::from_ref(&run)));
         facts.links.push((RUNS.to_owned(), "all runs".to_owned()));
@@ -326,7 +345,7 @@ async fn one(
         let mut episodes = Section::new("episodes", "Greedy episodes with its checkpoint");
         if run.path.join("checkpoints").is_dir() {
             for task in tasks(&run) {
-                episodes.links.push((format!("{RUNS}/{number}/{task}/0"), task));
+                episodes.links.push((address::episode(&name, &task, 0), task));
             }
         } else {
             episodes.text.push("It has left no checkpoint here to replay episodes from.".to_owned());
@@ -396,27 +415,23 @@ fn tasks(run: &Record) -> BTreeSet<String> {
 
 async fn episode(
     State(shown): State<Arc<Shown>>,
-    UrlPath((run, task, number)): UrlPath<(usize, String, u64)>,
+    UrlPath((run, task, number)): UrlPath<(String, String, u64)>,
 ) -> Result<Html<String>, Wrong> {
     apart(move || {
-        let record = shown.run(run)?;
-        if !tasks(&record).contains(&task) {
-            return Err(Wrong::NotFound);
-        }
+        let (record, next) = shown.episode(&run, &task, number)?;
         let mut section = Section::new("episode", &format!("{task}, episode {number}"));
         if has_scenes(&record, &task) {
-            let address = format!("{RUNS}/{run}/{task}/{number}/episode.gif");
-            section.image = Some((address, format!("episode {number} of {task}")));
+            section.image = Some((address::film(&run, &task, number), format!("episode {number} of {task}")));
         } else {
             section.tables.push(steps(&record, &task, number)?);
         }
         if let Some(before) = number.checked_sub(1) {
-            section.links.push((format!("{RUNS}/{run}/{task}/{before}"), "episode before".to_owned()));
+            section.links.push((address::episode(&run, &task, before), "episode before".to_owned()));
         }
-        section.links.push((format!("{RUNS}/{run}/{task}/{}", number + 1), "next episode".to_owned()));
-        section.links.push((format!("{RUNS}/{run}"), "the run".to_owned()));
+        section.links.push((address::episode(&run, &task, next), "next episode".to_owned()));
+        section.links.push((address::run(&run), "the run".to_owned()));
         section.links.push((RUNS.to_owned(), "all runs".to_owned()));
-        Ok(html(&shown.name(&record), &[section]))
+        Ok(html(&run, &[section]))
     })
     .await
 }
@@ -455,13 +470,10 @@ fn steps(run: &Record, task: &str, number: u64) -> Result<Table, Wrong> {
 
 async fn film(
     State(shown): State<Arc<Shown>>,
-    UrlPath((run, task, number)): UrlPath<(usize, String, u64)>,
+    UrlPath((run, task, number)): UrlPath<(String, String, u64)>,
 ) -> Result<Response, Wrong> {
     let gif = apart(move || {
-        let record = shown.run(run)?;
-        if !tasks(&record).contains(&task) {
-            return Err(Wrong::NotFound);
-        }
+        let (record, _) = shown.episode(&run, &task, number)?;
         Ok(render::replay(&record.path, &task, number)?)
     });
     Ok(([(header::CONTENT_TYPE, "image/gif")], gif.await?).into_response())

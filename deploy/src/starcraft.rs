@@ -54,7 +54,7 @@ pub async fn endpoint(options: EndpointOptions, logs: LogOptions) -> Result<Exit
     output::print(&format!("listening on ws://{address}/sc2api\n"))?;
     tokio::select! {
         served = tokio::task::spawn_blocking(serve) => {
-            served.map_err(Failure::runtime)?.map_err(Failure::runtime)?;
+            served.map_err(Failure::runtime)?;
         }
         () = shutdown => {}
     }
@@ -114,7 +114,7 @@ pub fn check(options: &StarCraftCheckOptions) -> Result<ExitCode, Failure> {
     output::print(&format!("refused       {} orders\n", game.orders_refused()))?;
     if let Some(path) = &options.replay {
         let replay = game.save_replay().map_err(Failure::runtime)?;
-        new_file::write(path, &replay, options.force)?;
+        new_file::write("--replay", path, &replay, options.force)?;
         output::print(&format!("replay        {}, {} bytes\n", path.display(), replay.len()))?;
     }
     game.quit();

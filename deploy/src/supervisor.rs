@@ -1,10 +1,11 @@
-//! Who of a run's processes is started, asked to end and killed, and when: the decisions of `rit train` as a state
+//! Which of a run's processes are started, asked to end and killed, and when: the decisions of `rit train` as a state
 //! machine. It is told what happened and at what time, and answers with what is to be done; processes, clocks and
 //! sockets are its shell's (`supervisor/shell.rs`). So the simulator (`soak/simulated`) drives this very code.
 //!
 //! An actor is its slot. Slots below the wanted count are filled, each by one process at a time, whatever died, left
 //! or was started in whatever order; a slot that is wanted again while its process still leaves waits for its end.
 
+mod interrupts;
 mod lifecycle;
 mod messages;
 mod process;
@@ -25,7 +26,7 @@ use std::{collections::BTreeMap, time::Duration};
 pub use messages::{Effect, Event, Exit, Hung, Outcome, Place, Standing};
 pub use shell::watch_over;
 
-/// Exit codes of a learner that has ended a run gracefully: as somebody asked it to, or as a signal did.
+/// Exit codes of a learner that has ended a run gracefully: as a caller asked it to, or as a signal did.
 const STOPPED: i32 = Ended::Stopped.exit_code() as i32;
 const INTERRUPTED: i32 = Ended::Interrupted.exit_code() as i32;
 
@@ -33,7 +34,7 @@ const INTERRUPTED: i32 = Ended::Interrupted.exit_code() as i32;
 /// needs minutes.
 const START_TIMEOUT: Duration = Duration::from_secs(600);
 
-/// When somebody is told that it has not answered yet; and how long one is waited for whose run shall end.
+/// After this a slow start is reported; a learner whose run is to end gets this long to answer.
 const SLOW_START: Duration = Duration::from_secs(30);
 
 /// How long processes may take to end once asked, before they are killed.
@@ -91,7 +92,8 @@ pub struct Supervisor {
     wanted: u32,
     /// A learner has answered at some time: what fails now is not what was typed.
     begun: bool,
-    interrupted: bool,
+    /// How often the run was asked to end.
+    interrupts: u32,
     /// The learner is writing its last files.
     run_ends: bool,
     /// Folder of the processes' logs, for messages.
@@ -108,7 +110,7 @@ impl Supervisor {
             actors: BTreeMap::new(),
             wanted: actors,
             begun: false,
-            interrupted: false,
+            interrupts: 0,
             run_ends: false,
             logs,
         }
@@ -123,7 +125,7 @@ impl Supervisor {
     pub fn deadline(&self) -> Option<Duration> {
         let start = match (&self.phase, &self.contact) {
             (Phase::Running, Contact::Starting { since, slow, .. }) if self.learner.is_up() => {
-                let said = *slow && !self.interrupted;
+                let said = *slow && self.interrupts == 0;
                 Some(*since + if said { START_TIMEOUT } else { SLOW_START })
             }
             _ => None,
@@ -197,7 +199,7 @@ impl Supervisor {
     fn adjust_actors(&mut self, now: Duration, effects: &mut Vec<Effect>) {
         let may_start = matches!(self.contact, Contact::Answering(..))
             && matches!(self.phase, Phase::Running)
-            && !self.interrupted
+            && self.interrupts == 0
             && !self.run_ends;
         let wanted = self.wanted;
         for slot in 0..wanted {
@@ -224,7 +226,7 @@ impl Supervisor {
         }
         self.begun = true;
         self.contact = Contact::Answering(now, 0);
-        if self.interrupted {
+        if self.interrupts > 0 {
             effects.push(Effect::StopRun);
         }
         self.adjust_actors(now, effects);
@@ -245,8 +247,12 @@ impl Supervisor {
                 self.kill(Place::Actor(slot), effects);
             }
         }
-        if self.interrupted || self.run_ends {
-            // Likewise.
+        if self.interrupts > 0 && !standing.ending && matches!(self.phase, Phase::Running) {
+            // It was asked to stop and did not hear it.
+            effects.push(Effect::StopRun);
+        }
+        if self.interrupts > 0 || self.run_ends {
+            // Actors that are down are not started again.
             self.actors.retain(|_, actor| actor.is_up());
             return;
         }
@@ -275,25 +281,6 @@ impl Supervisor {
         }
     }
 
-    fn interrupt(&mut self, now: Duration, effects: &mut Vec<Effect>) {
-        if std::mem::replace(&mut self.interrupted, true)
-            || matches!(self.phase, Phase::Ending(_) | Phase::Over)
-        {
-            return;
-        }
-        effects.push(Effect::Say("interrupted: shutting the run down gracefully".to_owned()));
-        // Who is not there is not needed any more.
-        self.actors.retain(|_, actor| actor.is_up());
-        match (&self.phase, &self.contact) {
-            (Phase::Running, Contact::Answering(..)) if self.learner.is_up() => {
-                effects.push(Effect::StopRun);
-            }
-            // One that has not answered yet is asked when it does.
-            (Phase::Running, Contact::Starting { .. }) if self.learner.is_up() => {}
-            _ => self.end(Outcome::Interrupted, now, effects),
-        }
-    }
-
     fn learner_ended(&mut self, exit: &Exit, last_words: &str, now: Duration, effects: &mut Vec<Effect>) {
         let was_anew = matches!(self.phase, Phase::Anew(_));
         self.learner.state = State::Down;
@@ -306,13 +293,13 @@ impl Supervisor {
         self.contact = Contact::starting(now);
         match exit {
             // It has ended the run gracefully, and its summary says how.
-            Exit::Code(0 | STOPPED) if !self.interrupted => self.end(Outcome::Finished, now, effects),
-            Exit::Code(0 | STOPPED | INTERRUPTED) if self.interrupted => {
+            Exit::Code(0 | STOPPED) if self.interrupts == 0 => self.end(Outcome::Finished, now, effects),
+            Exit::Code(0 | STOPPED | INTERRUPTED) if self.interrupts > 0 => {
                 self.end(Outcome::Interrupted, now, effects);
             }
-            // Somebody has ended the learner alone, which is no wish to end the run.
+            // A signal ended the learner alone; the run goes on.
             Exit::Code(INTERRUPTED) => self.restart(Place::Learner, exit, last_words, now, effects),
-            _ if self.interrupted => self.fail(false, died, now, effects),
+            _ if self.interrupts > 0 => self.fail(false, died, now, effects),
             // What was typed or given is wrong, and will be the second time.
             Exit::Code(2) => self.fail(true, last_words.to_owned(), now, effects),
             // It cannot have now what it had before: memory, a port, room on the disk.
@@ -349,7 +336,7 @@ impl Supervisor {
             self.go_on_if_all_are_down(effects);
             return;
         }
-        if self.interrupted || self.run_ends || slot >= self.wanted {
+        if self.interrupts > 0 || self.run_ends || slot >= self.wanted {
             self.actors.remove(&slot);
         } else if left {
             // It was not wanted for a while, and is again.
@@ -472,7 +459,7 @@ impl Supervisor {
         let waited = now.saturating_sub(*since);
         let why = if why.is_empty() { String::new() } else { format!(": {why}") };
         let log = format!("(log: {logs}/learner.log)");
-        if self.interrupted && waited >= SLOW_START {
+        if self.interrupts > 0 && waited >= SLOW_START {
             return self.end(Outcome::Interrupted, now, effects);
         }
         if waited >= START_TIMEOUT {

@@ -31,7 +31,7 @@ pub async fn run(options: TrainOptions, logs: LogOptions) -> Result<ExitCode, Fa
     let span = match started {
         Ok(span) => span,
         Err(failure) => {
-            owned.undo()?;
+            undo(owned);
             return Err(failure);
         }
     };
@@ -65,19 +65,27 @@ async fn supervise(
             let ended = Summary::read(run_dir).map_err(Failure::runtime)?.map(|summary| summary.ended);
             Ok(ExitCode::from(ended.unwrap_or(Ended::Failed).exit_code()))
         }
-        Outcome::Failed { input: true, message } => {
-            if !begun {
-                // The same command will do for the next attempt.
-                owned.undo()?;
-            }
-            Err(Failure::input_message(message))
-        }
-        Outcome::Failed { input: false, message } => {
-            if begun && let Err(error) = summary::write_failed(run_dir, &message) {
+        // A run that has begun has failed, whatever the reason: its summary and the exit code say the same.
+        Outcome::Failed { message, .. } if begun => {
+            if let Err(error) = summary::write_failed(run_dir, &message) {
                 tracing::warn!(%error, "summary.json was not written");
             }
             Err(Failure::runtime_message(message))
         }
+        Outcome::Failed { input: true, message } => {
+            undo(owned);
+            Err(Failure::input_message(message))
+        }
+        Outcome::Failed { input: false, message } => Err(Failure::runtime_message(message)),
+    }
+}
+
+/// Takes back what was made of a run that has not begun, so that the same command will do for the next attempt. Where that
+/// fails it is said here: the error to report is the one before.
+pub fn undo(owned: OwnedRunDir) {
+    if let Err(error) = owned.undo() {
+        // The run's log may be what was just taken away.
+        let _ = output::say(&format!("warning: what was made of the run is still there: {error}"));
     }
 }
 
@@ -119,7 +127,7 @@ fn prepare(options: &ConfigOptions) -> Result<Prepared, Failure> {
     said.extend(python_worlds::not_reproducible(&config));
     if let Some(beginning) = beginning {
         if let Err(failure) = beginning.write(owned.run_dir()) {
-            owned.undo()?;
+            undo(owned);
             return Err(failure);
         }
         said.push(beginning.words().to_owned());

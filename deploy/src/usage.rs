@@ -59,8 +59,8 @@ fn words(error: &Error, mut arguments: impl Iterator<Item = String>) -> String {
             let option = option(&argument);
             match context(ContextKind::ValidValue) {
                 _ if value.is_empty() => format!("{option} needs a value; `{help}` says which"),
-                Some(choices) => format!("{option} {value:?} is none of its choices: {choices}"),
-                None => format!("{option} {value:?} will not do; `{help}` says what will"),
+                Some(choices) => format!("{option} {value:?} is not one of: {choices}"),
+                None => format!("{option} {value:?} is not accepted; `{help}` lists what is"),
             }
         }
         ErrorKind::InvalidSubcommand => {
@@ -159,10 +159,7 @@ mod tests {
             (&["train", "x", "--seed", "-1"], "--seed \"-1\": write a whole number of at least 0"),
             (&["render", "--episodes", "21"], "--episodes \"21\": it is out of range 1..=20"),
             (&["plot", "x", "--out", "y", "--line", "nan"], "--line \"nan\": write a number, such as -12.5"),
-            (
-                &["train", "x", "--log-format", "xml"],
-                "--log-format \"xml\" is none of its choices: human, json",
-            ),
+            (&["train", "x", "--log-format", "xml"], "--log-format \"xml\" is not one of: human, json"),
             (&["train", "x", "--steps"], "--steps needs a value; `rit train --help` says which"),
             (&["trian"], "unknown command \"trian\"; did you mean train?"),
             (&["plot", "x"], "--out <FILE> is missing; `rit plot --help` explains it"),

@@ -1,4 +1,4 @@
-//! What a learner says that somebody should know of, each once.
+//! Prints each warning of the learner once.
 
 use rit_proto::v1::RunStatus;
 use std::collections::BTreeSet;

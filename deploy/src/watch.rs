@@ -59,11 +59,11 @@ pub async fn run(options: &WatchOptions) -> Result<ExitCode, Failure> {
 enum Ended {
     /// The run is over.
     Over,
-    /// Somebody wants no more of it.
+    /// `q` or Ctrl-C ended the view.
     Quit,
 }
 
-/// Until the run is over, or somebody wants no more of it.
+/// Until the run is over, or `q` or Ctrl-C ends the view.
 async fn watch(
     run_dir: &RunDir,
     config: &Config,

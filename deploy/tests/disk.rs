@@ -4,10 +4,14 @@
 mod common;
 
 use common::{RunFolder, Train, output};
-use rustix::mount::{MountFlags, UnmountFlags, mount, mount_remount, unmount};
+use rustix::{
+    mount::{MountFlags, UnmountFlags, mount, mount_remount, unmount},
+    process::Signal,
+};
 use std::{
     fs,
     path::{Path, PathBuf},
+    time::{Duration, Instant},
 };
 
 /// The folder of a run on a small file system of its own, where this process may make one.
@@ -107,6 +111,26 @@ fn a_disk_that_is_full_at_the_end_keeps_the_weights() {
     let rescued = fs::read_dir(elsewhere.path()).unwrap().next().unwrap().unwrap();
     assert!(rescued.file_name().to_str().unwrap().starts_with("run-step-"));
     assert!(rescued.metadata().unwrap().len() > 1000 && !digest.is_empty());
+}
+
+/// By default the last checkpoint is tried for ten minutes.
+#[test]
+fn a_second_interrupt_ends_the_wait_for_a_disk_that_stays_full() {
+    let folder = RunFolder::new();
+    let Some(disk) = SmallDisk::mount(&folder) else { return };
+    let mut train = folder.start(&[RUN, &["--steps", "1000000"]].concat());
+    train.wait_for("training", |status| status["updates"].as_u64() > Some(100));
+    disk.fill();
+    train.signal(Signal::INT);
+    train.wait_for("a warning", |status| {
+        status["happenings"].to_string().contains("the last checkpoint is not written")
+    });
+    let begun = Instant::now();
+    train.signal(Signal::INT);
+    let output = train.wait();
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{stderr}");
+    assert!(begun.elapsed() < Duration::from_secs(120), "{:?}", begun.elapsed());
 }
 
 #[test]

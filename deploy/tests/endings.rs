@@ -159,6 +159,29 @@ fn a_learner_whose_run_was_removed_ends_with_its_supervisor() {
 }
 
 #[test]
+fn a_third_interrupt_ends_a_run_whose_learner_hangs() {
+    let folder = RunFolder::new();
+    let mut train = under_way(&folder, &[]);
+    let learner = learner_pid(&train.wait_for("the learner", |_| true));
+    let log = folder.run_dir().join("logs/train.log");
+    kill(learner, Signal::STOP);
+    for said in ["interrupted: shutting the run down", "interrupted again: "] {
+        train.signal(Signal::INT);
+        while !fs::read_to_string(&log).unwrap().contains(said) {
+            std::thread::yield_now();
+        }
+    }
+    train.signal(Signal::INT);
+    let output = train.wait();
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{stderr}");
+    assert!(stderr.contains("interrupted three times, and its processes were killed"), "{stderr}");
+    wait_until_gone(learner);
+    assert_eq!(summary(&folder)["ended"], "failed");
+    assert!(fs::read_to_string(&log).unwrap().contains("a second interrupt ends the retries"));
+}
+
+#[test]
 fn a_learner_that_is_asked_to_end_alone_is_restarted() {
     for signal in [Signal::TERM, Signal::INT] {
         let folder = RunFolder::new();
@@ -188,6 +211,22 @@ fn a_learner_of_its_own_ends_as_interrupted() {
     kill(learner.id(), Signal::TERM);
     assert_eq!(learner.wait().unwrap().code(), Some(130));
     assert_eq!(summary(&folder)["ended"], "interrupted");
+}
+
+/// A learner that is restarted reads its configuration anew: what is wrong with it then was not typed, and the run has
+/// failed.
+#[test]
+fn a_run_that_is_spoilt_while_it_goes_on_says_the_same_in_summary_and_exit_code() {
+    let folder = RunFolder::new();
+    let mut train = under_way(&folder, &[]);
+    let learner = learner_pid(&train.wait_for("the learner", |_| true));
+    fs::write(folder.run_dir().join("config.toml"), "nonsense").unwrap();
+    kill(learner, Signal::KILL);
+    let output = train.wait();
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    let ended = summary(&folder);
+    assert_eq!((output.status.code(), &ended["ended"]), (Some(1), &"failed".into()), "{stderr}");
+    assert!(ended["reason"].as_str().unwrap().contains("config.toml"), "{ended}");
 }
 
 #[test]

@@ -24,7 +24,7 @@ fn run<'a>(method: Method, steps: &'a str, actors: &'a str) -> Vec<&'a str> {
 }
 
 #[test]
-fn the_same_seed_gives_the_same_weights_with_every_method_whoever_rolls() {
+fn the_same_seed_gives_the_same_weights_with_every_method_and_any_number_of_actors() {
     for method in Method::ALL {
         let digest = |actors| {
             let summary = RunFolder::new().train(&run(method, "160", actors));
@@ -57,33 +57,53 @@ fn room_for_larger_teams_changes_no_weight() {
     }
 }
 
-/// A rival of replay's regime, and one that draws numbers of its own; `on_policy.rs` has the others.
-#[test]
-fn whoever_is_killed_the_weights_are_those_of_an_undisturbed_run() {
-    for method in [Method::VdnAttn, Method::Roma] {
-        let arguments = |actors| {
-            let mut run = run(method, "1600", actors);
-            run.extend(["--set", "checkpoints.every_env_steps=200"]);
-            run
-        };
-        let undisturbed = RunFolder::new().train(&arguments("1"));
-        let folder = RunFolder::new();
-        let mut train = folder.start(&arguments("2"));
-        let status = train.wait_for("an actor", |status| actor_pid(status, "actor-0").is_some());
-        let victim = actor_pid(&status, "actor-0").unwrap();
-        kill(victim, Signal::KILL);
-        let status = train.wait_for("its successor, and a checkpoint", |status| {
-            actor_pid(status, "actor-0").is_some_and(|pid| pid != victim)
-                && status["checkpoints"]["written"].as_u64() > Some(0)
-        });
-        let victim = learner_pid(&status);
-        kill(victim, Signal::KILL);
-        train.wait_for("its successor", |status| learner_pid(status) != victim);
-        let summary = train.finish();
-        for key in ["weights_digest", "env_steps", "episodes", "updates", "evaluation"] {
-            assert_eq!(summary[key], undisturbed[key], "{method}: {key}");
-        }
+/// An actor is killed, then the learner: the end is that of an undisturbed run.
+fn kills_change_nothing(method: Method) {
+    let arguments = |actors| {
+        let mut run = run(method, "1600", actors);
+        run.extend(["--set", "checkpoints.every_env_steps=200"]);
+        run
+    };
+    let undisturbed = RunFolder::new().train(&arguments("1"));
+    let folder = RunFolder::new();
+    let mut train = folder.start(&arguments("2"));
+    let status = train.wait_for("an actor", |status| actor_pid(status, "actor-0").is_some());
+    let victim = actor_pid(&status, "actor-0").unwrap();
+    kill(victim, Signal::KILL);
+    let status = train.wait_for("its successor, and a checkpoint", |status| {
+        actor_pid(status, "actor-0").is_some_and(|pid| pid != victim)
+            && status["checkpoints"]["written"].as_u64() > Some(0)
+    });
+    let victim = learner_pid(&status);
+    kill(victim, Signal::KILL);
+    train.wait_for("its successor", |status| learner_pid(status) != victim);
+    let summary = train.finish();
+    for key in ["weights_digest", "env_steps", "episodes", "updates", "evaluation"] {
+        assert_eq!(summary[key], undisturbed[key], "{method}: {key}");
     }
+}
+
+// A method of each kind of networks, and each that draws numbers of its own. `on_policy.rs` has MAPPO and MAT,
+// `recovery.rs` RIT.
+
+#[test]
+fn kills_change_nothing_for_vdn_attn() {
+    kills_change_nothing(Method::VdnAttn);
+}
+
+#[test]
+fn kills_change_nothing_for_updet_mix() {
+    kills_change_nothing(Method::UpdetMix);
+}
+
+#[test]
+fn kills_change_nothing_for_refil() {
+    kills_change_nothing(Method::Refil);
+}
+
+#[test]
+fn kills_change_nothing_for_roma() {
+    kills_change_nothing(Method::Roma);
 }
 
 #[test]
@@ -141,6 +161,10 @@ fn what_does_not_go_with_a_method_is_refused_in_a_line() {
         &["algorithm.imagined_weight means nothing to vdn-attn; these have it: refil"],
     );
     train(
+        &["--algorithm", "vdn-attn", "--set", "algorithm.lambda=0.3"],
+        &["unknown key \"algorithm.lambda\"; [algorithm] has batch_size, buffer_size, encoder, epsilon_"],
+    );
+    train(
         &["--algorithm", "mappo", "--set", "algorithm.buffer_size=100"],
         &["algorithm.buffer_size means nothing to mappo; these have it: rit, "],
     );
@@ -166,7 +190,7 @@ fn a_run_keeps_its_method() {
         &["train", "--resume", root, "--algorithm", "mappo", "--steps", "80"],
         &["begun with the algorithm vdn-attn and cannot go on with mappo"],
     );
-    // Somebody writes another method into the run's own configuration.
+    // Another method is written into the run's own configuration.
     let config = fs::read_to_string(run_dir.join("config.toml")).unwrap();
     fs::write(run_dir.join("config.toml"), config.replace("vdn-attn", "vdn-int")).unwrap();
     let resumed = output(&["train", "--resume", root, "--steps", "80"]);

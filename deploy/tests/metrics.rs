@@ -110,7 +110,7 @@ async fn a_status_accounts_for_everything() {
     let checkpoints = status.checkpoints.unwrap();
     assert_eq!((checkpoints.written, checkpoints.failed), (1, 0));
     assert!(checkpoints.last_s > 0.0 && checkpoints.total_s == checkpoints.last_s);
-    // Somebody always waits: two actors are more than this learner needs, or fewer.
+    // One side always waits: two actors are more than this learner needs, or fewer.
     let waited: f64 = status.actors.iter().map(|actor| actor.waiting_s).sum();
     assert!(waited + status.learner_waiting_s > 0.0);
     // A pause counts as no one's waiting.

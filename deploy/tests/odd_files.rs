@@ -45,7 +45,7 @@ fn files(folder: &Path, below: &Path, found: &mut Vec<String>) {
 }
 
 #[test]
-fn nobody_waits_at_a_pipe_in_the_place_of_a_file() {
+fn no_command_waits_at_a_pipe_in_the_place_of_a_file() {
     let folder = RunFolder::new();
     folder.train(&["matrix-game", "--steps", "40", "--actors", "1", "--set", "evaluation.episodes=1"]);
     let run_dir = folder.run_dir();

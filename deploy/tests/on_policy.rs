@@ -57,7 +57,7 @@ fn kills_change_nothing_for_mat() {
 /// Particle worlds, where MAPPO's agents remember and MAT's episodes are cut off at the limit: however many actors, however
 /// many episodes side by side, however many threads.
 #[test]
-fn the_same_seed_gives_the_same_weights_whoever_rolls() {
+fn the_same_seed_gives_the_same_weights_with_any_number_of_actors() {
     for method in ["mappo", "mat"] {
         let digest = |arguments: &[&str]| {
             let run = ["cooperative-navigation", "--algorithm", method, "--steps", "1000"];
@@ -75,6 +75,21 @@ fn the_same_seed_gives_the_same_weights_whoever_rolls() {
     }
 }
 
+/// Actors obey `algorithm.time_limit`: the world calls its limit an end, a method may call it a cut.
+#[test]
+fn actors_end_episodes_at_the_time_limit_as_the_settings_say() {
+    let digest = |time_limit: &str| {
+        let run = ["cooperative-navigation", "--algorithm", "mappo", "--steps", "400", "--actors", "1"];
+        let few = ["--set", "evaluation.episodes=1", "--set", "evaluation.testing_episodes=1"];
+        let setting = format!("algorithm.time_limit={time_limit}");
+        let summary = RunFolder::new().train(&[&run[..], &few, &["--set", &setting]].concat());
+        summary["weights_digest"].clone()
+    };
+    let [environment, terminated, truncated] = ["environment", "terminated", "truncated"].map(digest);
+    assert_eq!(environment, terminated);
+    assert_ne!(environment, truncated);
+}
+
 #[test]
 fn what_is_measured_is_what_the_method_declares() {
     let folder = RunFolder::new();
@@ -89,7 +104,7 @@ fn what_is_measured_is_what_the_method_declares() {
     assert!(value("actor_grad_norm") > 0.0 && value("critic_grad_norm") > 0.0);
     assert!(line.get("td_loss").is_none(), "{line}");
 
-    // Its checkpoint is its own: another method does not go on from it.
+    // Its checkpoint is its own: another method cannot go on from it.
     let run_dir = folder.run_dir();
     let refused = output(&["train", "--resume", run_dir.to_str().unwrap(), "--algorithm", "mat"]);
     assert_eq!(refused.status.code(), Some(2));

@@ -118,7 +118,7 @@ fn train(folder: &RunFolder, stdout: Stdio, stderr: Stdio) -> Option<i32> {
 }
 
 #[test]
-fn a_run_goes_on_whoever_listens_and_says_so_in_its_log() {
+fn a_run_goes_on_without_a_reader_and_says_so_in_its_log() {
     let cases: [(Stdio, Stdio, &str); 4] = [
         (closed_pipe().into(), closed_pipe().into(), "Broken pipe"),
         (full(), full(), "No space left on device"),
@@ -158,7 +158,7 @@ fn a_run_goes_on_when_its_reader_leaves_after_the_first_line() {
 }
 
 #[test]
-fn a_run_goes_on_beside_a_pipe_that_is_full_and_that_nobody_reads() {
+fn a_run_goes_on_beside_a_full_pipe_without_a_reader() {
     let (reader, mut writer) = std::io::pipe().unwrap();
     rustix::io::ioctl_fionbio(&writer, true).unwrap();
     while writer.write(&[b'.'; 4096]).is_ok() {}
@@ -172,7 +172,7 @@ fn a_run_goes_on_beside_a_pipe_that_is_full_and_that_nobody_reads() {
 }
 
 #[test]
-fn watching_and_following_end_when_nobody_reads_them() {
+fn watching_and_following_end_when_their_reader_has_gone() {
     let folder = RunFolder::new();
     let mut run =
         folder.start(&["matrix-game", "--actors", "1", "--set", "learner.metrics_every_env_steps=2"]);

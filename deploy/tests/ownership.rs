@@ -253,7 +253,7 @@ fn what_a_dead_life_has_left_is_removed_by_the_next() {
 }
 
 #[test]
-fn files_of_other_users_are_in_nobodys_way() {
+fn files_of_other_users_are_in_no_runs_way() {
     let folder = RunFolder::new();
     let mut train = folder.start(&long());
     let status = under_way(&mut train);

@@ -79,7 +79,7 @@ def create(controller, first_type):
 
 def decide(unit, allies, enemies, rng):
     """Attack whom the unit reaches, or heal who is hurt, mostly; else walk, or stop."""
-    # Medivacs alone fly: whom everybody can hit are the others.
+    # Medivacs alone fly: all units can hit the others.
     hurt = [a for a in allies if not a.is_flying and a.health < a.health_max]
     others, ability = (hurt, HEAL) if unit.is_flying else ([e for e in enemies if not e.is_flying], ATTACK)
     near = [o for o in others if math.hypot(o.pos.x - unit.pos.x, o.pos.y - unit.pos.y) <= REACH]

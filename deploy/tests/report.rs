@@ -54,6 +54,12 @@ fn a_report_of_a_run_holds_its_representations_and_nothing_else_is_written_over(
     refused(&arguments(&[]), &["holds something else than a report: thesis.tex", "--force"]);
     assert!(output(&arguments(&["--force"])).status.success());
     assert_eq!(fs::read_to_string(out.join("thesis.tex")).unwrap(), "mine");
+    let foreign = folder.path().join("foreign");
+    fs::create_dir_all(foreign.join("figures")).unwrap();
+    fs::write(foreign.join("figures/mine.svg"), "mine").unwrap();
+    let beside = ["report", run, "--replications", "200", "--out", foreign.to_str().unwrap()];
+    refused(&beside, &["holds figures, and no index.html", "--force"]);
+    assert_eq!(fs::read_to_string(foreign.join("figures/mine.svg")).unwrap(), "mine");
     let elsewhere = folder.path().join("elsewhere");
     let elsewhere = ["--out", elsewhere.to_str().unwrap()];
     refused(&[&["report", run, run], &elsewhere[..]].concat(), &["are the same run"]);

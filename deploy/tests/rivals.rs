@@ -13,7 +13,7 @@ fn matrix(method: &str) -> Vec<&str> {
 
 /// REFIL draws groups at each update; ROMA draws noise at each update, and more while it acts.
 #[test]
-fn the_same_seed_gives_the_same_weights_whoever_rolls() {
+fn the_same_seed_gives_the_same_weights_with_any_number_of_actors() {
     for method in ["updet-mix", "refil", "roma"] {
         let digest = |arguments: &[&str]| {
             let summary = RunFolder::new().train(&[&matrix(method), arguments].concat());

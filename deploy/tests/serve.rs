@@ -10,7 +10,11 @@ use std::{
     io::{BufRead as _, BufReader, Read as _, Write as _},
     net::TcpStream,
     process::{Child, Stdio},
+    time::{Duration, Instant},
 };
+
+/// What a run needs to be over at once.
+const TINY: [&str; 6] = ["--steps", "40", "--actors", "1", "--set", "evaluation.episodes=1"];
 
 /// A server, ended when dropped.
 struct Server {
@@ -59,7 +63,7 @@ impl Drop for Server {
 }
 
 #[test]
-fn a_folder_of_runs_is_shown_to_whoever_knows_the_token() {
+fn a_folder_of_runs_is_shown_to_callers_that_know_the_token() {
     let folder = RunFolder::new();
     folder.train(&["cooperative-navigation", "--steps", "200", "--set", "evaluation.episodes=2"]);
     let server = Server::start(folder.path().to_str().unwrap());
@@ -76,22 +80,60 @@ fn a_folder_of_runs_is_shown_to_whoever_knows_the_token() {
     assert_eq!(server.get("/runs", &cookie).0, 200);
 
     let all = server.page("/runs");
-    for word in ["Cooperative navigation", "<svg", "finished", "href=\"/runs/0\""] {
+    for word in ["Cooperative navigation", "<svg", "finished", "href=\"/runs/run\""] {
         assert!(all.contains(word), "{word:?} is not in {all}");
     }
     assert!(!all.contains("<script") && !all.contains("<style"), "the policy would not let them in");
-    let one = server.page("/runs/0");
-    assert!(one.contains("href=\"/runs/0/navigation-4-4/0\"") && one.contains("navigation-2-2"), "{one}");
-    assert!(server.page("/runs/0/navigation-4-4/7").contains("src=\"/runs/0/navigation-4-4/7/episode.gif\""));
+    let one = server.page("/runs/run");
+    assert!(one.contains("href=\"/runs/run/navigation-4-4/0\"") && one.contains("navigation-2-2"), "{one}");
+    let episode = server.page("/runs/run/navigation-4-4/7");
+    assert!(episode.contains("src=\"/runs/run/navigation-4-4/7/episode.gif\""), "{episode}");
     let bearer = format!("Authorization: Bearer {}\r\n", server.token);
-    let (status, head, gif) = server.get("/runs/0/navigation-4-4/7/episode.gif", &bearer);
+    let (status, head, gif) = server.get("/runs/run/navigation-4-4/7/episode.gif", &bearer);
     assert!(
         status == 200 && head.contains("content-type: image/gif") && gif.starts_with(b"GIF89a"),
         "{head}"
     );
-    for nothing in ["/runs/1", "/runs/0/navigation-9-9/0", "/runs/0/..%2f..%2fetc/0", "/elsewhere"] {
+    let last = format!("/runs/run/navigation-4-4/{}", u64::MAX);
+    let nothing = [
+        "/runs/0",
+        "/runs/..%2Frun",
+        "/runs/run/navigation-9-9/0",
+        "/runs/run/..%2f..%2fetc/0",
+        "/elsewhere",
+    ];
+    for nothing in nothing.into_iter().chain([&*last, &*format!("{last}/episode.gif")]) {
         assert_eq!(server.get(nothing, &bearer).0, 404, "{nothing}");
     }
+
+    // A run that comes before it in the list takes no other's address.
+    let other = folder.path().join("another one");
+    let trained =
+        rit(&["train", "matrix-game", "--json", "--run-dir", other.to_str().unwrap()]).args(TINY).output();
+    assert!(trained.unwrap().status.success());
+    let all = server.page("/runs");
+    assert!(all.contains("href=\"/runs/another%20one\"") && all.contains("href=\"/runs/run\""), "{all}");
+    for (page, task) in [("/runs/run", "navigation-2-2"), ("/runs/another%20one", "game-1")] {
+        assert!(server.page(page).contains(task), "{page}");
+    }
+}
+
+/// Browsers hold connections that they may use again.
+#[test]
+fn an_idle_connection_does_not_keep_it_from_ending() {
+    let folder = RunFolder::new();
+    folder.train(&[&["matrix-game"], &TINY[..]].concat());
+    let server = Server::start(folder.path().to_str().unwrap());
+    let mut idle = TcpStream::connect(&server.address).unwrap();
+    let (host, token) = (&server.address, &server.token);
+    write!(idle, "GET /page.css HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {token}\r\n\r\n").unwrap();
+    let mut answer = [0; 12];
+    idle.read_exact(&mut answer).unwrap();
+    assert_eq!(&answer, b"HTTP/1.1 200");
+    let begun = Instant::now();
+    drop(server);
+    // The connection might lie idle for ten seconds.
+    assert!(begun.elapsed() < Duration::from_secs(6), "{:?}", begun.elapsed());
 }
 
 #[test]

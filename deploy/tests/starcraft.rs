@@ -246,7 +246,7 @@ fn settings_that_mean_nothing_there_are_refused() {
     };
     for (experiment, settings, words) in [
         ("matrix-game", &["environment.backend=starcraft"][..], "plays combat, and matrix-game is none"),
-        ("3-8m", &["environment.backend=real"], "is none of its choices: embedded, starcraft"),
+        ("3-8m", &["environment.backend=real"], "is not one of: embedded, starcraft"),
         ("3-8m", &["starcraft.custom_types=1970"], "starcraft.custom_types means nothing with"),
         (
             "3-8m",

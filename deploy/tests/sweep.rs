@@ -175,6 +175,22 @@ fn a_cell_that_fails_is_reported_and_the_others_go_on() {
 }
 
 #[test]
+fn a_cell_whose_process_cannot_be_started_ends_no_other() {
+    let sweep = Sweep::new(&SWEEP.replace("[1, 2]", "[1]"));
+    let script = sweep.folder.path().join("job.sbatch");
+    assert!(sweep.command(&["--slurm", script.to_str().unwrap()]).status().unwrap().success());
+    // A folder where the first cell's log should lie.
+    let log = sweep.dir().join("logs/rit_seed-1.log");
+    fs::create_dir_all(&log).unwrap();
+    let (code, done, stderr) = sweep.run(&["--jobs", "2"]);
+    assert_eq!((code, &done["counts"]["finished"]), (Some(1), &1.into()), "{stderr}");
+    assert!(stderr.contains("rit_seed-1: its process could not be started"), "{stderr}");
+    fs::remove_dir(&log).unwrap();
+    let (code, done, stderr) = sweep.run(&["--jobs", "2"]);
+    assert_eq!((code, &done["counts"]["finished"]), (Some(0), &2.into()), "{stderr}");
+}
+
+#[test]
 fn an_interrupted_sweep_goes_on_to_the_same_weights() {
     let text = SWEEP.replace("= 400", "= 2500").replace("[1, 2]", "[1]");
     let sweep = Sweep::new(&text);
@@ -204,7 +220,7 @@ fn an_interrupted_sweep_goes_on_to_the_same_weights() {
 
 /// ROMA with the largest learning rate there is diverges in its second update (`divergence.rs`).
 #[test]
-fn a_cell_that_has_diverged_is_not_tried_again_unless_somebody_asks() {
+fn a_cell_that_has_diverged_is_not_tried_again_but_with_retry() {
     let text = "experiment = \"matrix-game\"\nseeds = [3]\n[set]\n\"algorithm.name\" = \"roma\"\n\"algorithm.lr\" = 1.0\n\
                 \"training.t_max\" = 2000\n\"evaluation.episodes\" = 1\n\"checkpoints.every_env_steps\" = 8\n";
     let sweep = Sweep::new(text);
@@ -304,7 +320,8 @@ fn a_job_of_an_array_runs_its_cell_and_goes_on_with_it() {
 
 #[test]
 fn a_cluster_of_containers_is_told_the_whole_sweep() {
-    let text = SWEEP.replace("\"matrix-game\"", "\"own/small game.toml\"");
+    // A first line that is indented has its place too.
+    let text = format!("  # Two methods{}", SWEEP.replace("\"matrix-game\"", "\"own/small game.toml\""));
     let sweep = Sweep::new(&text);
     let own = sweep.folder.path().join("own/small game.toml");
     fs::create_dir(own.parent().unwrap()).unwrap();
@@ -313,12 +330,12 @@ fn a_cluster_of_containers_is_told_the_whole_sweep() {
     let written = sweep.command(&["--kubernetes", out.to_str().unwrap(), "--queue", "lab"]).output().unwrap();
     assert!(written.status.success(), "{}", String::from_utf8_lossy(&written.stderr));
     let job = fs::read_to_string(&out).unwrap();
-    let (_, data) = job.split_once("  sweep.toml: |\n").unwrap();
-    let (data, _) = data.split_once("  experiment-0.toml: |\n").unwrap();
+    let (_, data) = job.split_once("  sweep.toml: |2\n").unwrap();
+    let (data, _) = data.split_once("  experiment-0.toml: |2\n").unwrap();
     let found: String =
         data.lines().map(|line| line.strip_prefix("    ").unwrap_or(line).to_owned() + "\n").collect();
     assert_eq!(found, text);
-    let own = "  experiment-0.toml: |\n    environment.task_set = \"matrix-game\"\n---\n";
+    let own = "  experiment-0.toml: |2\n    environment.task_set = \"matrix-game\"\n---\n";
     let item = "- { key: experiment-0.toml, path: \"own/small game.toml\" }\n";
     for part in [
         own,

@@ -56,7 +56,7 @@ fn two_actors_and_a_learner_train_and_leave_a_whole_run_directory() {
 }
 
 #[test]
-fn the_same_seed_gives_the_same_weights_whoever_rolls() {
+fn the_same_seed_gives_the_same_weights_with_any_number_of_actors() {
     let digest = |arguments: &[&str]| {
         let folder = RunFolder::new();
         let summary = folder.train(&short(arguments));

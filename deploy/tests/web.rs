@@ -76,7 +76,7 @@ impl Server {
         Answer { status, head: head.to_lowercase(), body: body.to_owned() }
     }
 
-    /// As somebody who knows the token.
+    /// As a caller who knows the token.
     fn get(&self, path: &str) -> Answer {
         self.send(&format!("GET {path}"), &[("Authorization", &format!("Bearer {}", self.token))], "")
     }
@@ -284,7 +284,7 @@ fn position_of(server: &Server) -> String {
 }
 
 #[test]
-fn whoever_looks_on_changes_no_weight() {
+fn looking_on_changes_no_weight() {
     let arguments = ["matrix-game", "--actors", "1", "--seed", "3", "--steps", "2000"];
     let alone = RunFolder::new().train(&[&arguments[..], &["--set", "web.listen=off"]].concat());
     let folder = RunFolder::new();

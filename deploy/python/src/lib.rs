@@ -1,7 +1,9 @@
 //! The native part of the Python module `rit`: trained policies, by the same code as `rit evaluate`. Arrays come and go as
 //! bytes in native order; `python/rit/policy.py` gives them their shapes.
 
-use pyo3::{create_exception, exceptions::PyValueError, prelude::*, pybacked::PyBackedBytes};
+use pyo3::{
+    create_exception, exceptions::PyValueError, prelude::*, pybacked::PyBackedBytes, sync::MutexExt as _,
+};
 use rit_episode::Observation;
 use rit_policy::{State, TrainedPolicy};
 use std::{
@@ -35,25 +37,25 @@ impl NativePolicy {
     }
 
     /// What the weights file says of itself: JSON.
-    fn description(&self) -> PyResult<String> {
-        self.policy().description().to_json().map_err(|error| WeightsError::new_err(error.to_string()))
+    fn description(&self, py: Python<'_>) -> PyResult<String> {
+        self.policy(py).description().to_json().map_err(|error| WeightsError::new_err(error.to_string()))
     }
 
     /// Features, actions, and numbers in a task representation.
-    fn sizes(&self) -> (usize, usize, usize) {
-        let policy = self.policy();
+    fn sizes(&self, py: Python<'_>) -> (usize, usize, usize) {
+        let policy = self.policy(py);
         (policy.feature_dim(), policy.n_actions(), policy.representation_dim())
     }
 
     /// Begins an episode.
     #[pyo3(signature = (episode, n_agents, order=None))]
-    fn begin(&self, episode: usize, n_agents: usize, order: Option<Vec<u8>>) -> PyResult<()> {
-        self.policy().begin(episode, n_agents, order).map_err(refused)
+    fn begin(&self, py: Python<'_>, episode: usize, n_agents: usize, order: Option<Vec<u8>>) -> PyResult<()> {
+        self.policy(py).begin(episode, n_agents, order).map_err(refused)
     }
 
     /// One joint action of each episode that is given.
     fn act(&self, py: Python<'_>, seen: Vec<Seen>) -> PyResult<()> {
-        let mut policy = self.policy();
+        let mut policy = self.policy(py);
         let (features, n_actions) = (policy.feature_dim(), policy.n_actions());
         let observations: Vec<Observation> =
             seen.iter().map(|seen| observation(seen, features, n_actions)).collect::<PyResult<_>>()?;
@@ -67,25 +69,27 @@ impl NativePolicy {
     }
 
     /// The joint action of an episode's last step, an action a byte.
-    fn actions(&self, episode: usize) -> Cow<'static, [u8]> {
-        self.policy().actions(episode).to_vec().into()
+    fn actions(&self, py: Python<'_>, episode: usize) -> Cow<'static, [u8]> {
+        self.policy(py).actions(episode).to_vec().into()
     }
 
     /// The utilities of an episode's last step, f4.
-    fn utilities(&self, episode: usize) -> Cow<'static, [u8]> {
-        to_bytes(self.policy().utilities(episode))
+    fn utilities(&self, py: Python<'_>, episode: usize) -> Cow<'static, [u8]> {
+        to_bytes(self.policy(py).utilities(episode))
     }
 
     /// The task representations of an episode's last step, f4.
-    fn task_representations(&self, episode: usize) -> Cow<'static, [u8]> {
-        to_bytes(self.policy().task_representations(episode))
+    fn task_representations(&self, py: Python<'_>, episode: usize) -> Cow<'static, [u8]> {
+        to_bytes(self.policy(py).task_representations(episode))
     }
 }
 
 impl NativePolicy {
-    fn policy(&self) -> MutexGuard<'_, TrainedPolicy> {
+    /// Waits for the policy without the interpreter's lock: another thread's `act` holds the policy, and needs that lock to
+    /// come back.
+    fn policy(&self, py: Python<'_>) -> MutexGuard<'_, TrainedPolicy> {
         // A call that panicked has not begun to change anything that the next one reads before writing it.
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        self.0.lock_py_attached(py).unwrap_or_else(PoisonError::into_inner)
     }
 }
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -135,6 +136,28 @@ def test_a_copy_cut_off_half_way_or_altered_does_not_count(run, tmp_path, capsys
     (store / "checkpoints/step-000000000900.json").unlink()
     assert copied(run, url, "--once") == 0
     assert stored(store) == whole
+
+
+def test_later_checkpoints_at_the_same_step_are_copied_and_the_last_of_them_is_the_newest(run, undisturbed, tmp_path, capsys):
+    again, store = tmp_path / "run", tmp_path / "store"
+    url = f"file://{store}"
+    shutil.copytree(run, again, symlinks=True, ignore=shutil.ignore_patterns("*.sock"))
+    assert copied(again, url, "--once", "--keep", "2") == 0
+    latest = again / "checkpoints/latest"
+    first = os.readlink(latest)
+    names = [f"{first}-{repetition}" for repetition in (2, 9, 10)]
+    for name in names:
+        shutil.copytree(again / "checkpoints" / first, again / "checkpoints" / name)
+        latest.unlink()
+        latest.symlink_to(name)
+        assert copied(again, url, "--once", "--keep", "2") == 0
+        assert f"{name} copied" in capsys.readouterr().out
+    assert sorted(path.name for path in (store / "checkpoints").iterdir()) == [f"{first}-10.json", f"{first}-9.json"]
+    for at, arguments in enumerate([[], ["--at", "800"]]):
+        back = tmp_path / f"back{at}"
+        assert main(["--from", url, "--run", str(back), *arguments]) == 0
+        assert os.readlink(back / "checkpoints/latest") == names[-1]
+    assert train(back, "--resume", back, "--steps", 1200) == undisturbed
 
 
 @pytest.mark.parametrize("path", ["../out", "/out", "learner.sock", "checkpoints/../../out", "replay/x", "token"])

@@ -178,7 +178,7 @@ def test_one_that_hangs_is_the_one_that_is_named(tmp_path):
     assert time.monotonic() - begun < 60, "a worker that is up is not waited for as if it came up"
 
 
-def test_a_slow_neighbour_makes_nobody_late(tmp_path):
+def test_a_slow_environment_delays_no_other(tmp_path):
     """Three steps of 0.4 s each are in time, where each may take 0.9 s."""
     path = experiment(tmp_path, training=["slow-2"], timeout_ms=900)
     settings = ("--set", "algorithm.n_rollout_threads=3", "--set", "evaluation.episodes=1")

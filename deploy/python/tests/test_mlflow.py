@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 from conftest import RIT
 
-from rit.mlflow import Lines, main, scalars
+from rit import wandb
+from rit.mlflow import Lines, main, objects, read_summary, scalars
 
 PROGRAM = Path(sys.executable).parent / "mlflow"
 FOLLOW = [sys.executable, "-m", "rit.mlflow", "--every", "0.2"]
@@ -121,6 +122,25 @@ def test_a_file_that_grows_and_is_cut_is_read_whole(tmp_path):
     assert list(lines.new()) == [b"three\n"]
     file.write_bytes(b"one\n2\nthird and longer\n")
     assert list(lines.new()) == [b"one\n", b"2\n", b"third and longer\n"], "cut at a checkpoint and grown beyond"
+
+
+def test_a_torn_line_is_left_out_and_a_torn_summary_is_named(tmp_path, capsys):
+    file, summary = tmp_path / "metrics.jsonl", tmp_path / "summary.json"
+    file.write_bytes(b'{"kind": "evaluation"}\n{"kind": "trai\n\x00\xff\n7\n{"kind": "training"}\n{"kind": "trai')
+    lines = Lines(file)
+    assert objects(lines.new()) == [{"kind": "evaluation"}, {"kind": "training"}]
+    with open(file, "ab") as more:
+        more.write(b'ning", "env_steps": 8}\n')
+    assert objects(lines.new()) == [{"kind": "training", "env_steps": 8}], "a line is read once it is whole"
+    assert read_summary(tmp_path) is None
+    for torn in (b'{"ended": "fin', b"\xff\xfe", b"[]"):
+        summary.write_bytes(torn)
+        asked = ["--run", str(tmp_path)]
+        assert main([*asked, "--uri", "http://127.0.0.1:1", "--once", "--patience", "0"]) == 1
+        assert f"{summary} cannot be read" in capsys.readouterr().err
+        file.write_bytes(b'{"kind": "run", "run_id": "0"}\n')
+        assert wandb.main([*asked, "--dir", str(tmp_path)]) == 1
+        assert f"{summary} cannot be read" in capsys.readouterr().err
 
 
 def test_a_server_that_is_not_there_is_said(matrix_run, capsys):

@@ -1,4 +1,4 @@
-"""An environment that nobody here wrote: simple_spread of mpe2, of two and four agents in training, two to five in testing."""
+"""An environment of another project: simple_spread of mpe2, of two and four agents in training, two to five in testing."""
 
 import json
 

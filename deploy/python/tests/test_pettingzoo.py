@@ -1,4 +1,4 @@
-"""Environments that nobody here wrote: PettingZoo's own, one whose agents die, and one with action masks and turns."""
+"""Environments of other projects: PettingZoo's own, one whose agents die, and one with action masks and turns."""
 
 import json
 

@@ -1,6 +1,8 @@
 """A trained policy in Python is the one that `rit evaluate` measures."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -141,3 +143,33 @@ def test_errors_have_the_programs_words(matrix_run, tmp_path):
     (tmp_path / "torn").write_bytes(b"\x00" * 20)
     with pytest.raises(package.WeightsError, match="no whole safetensors file"):
         package.Policy.load(tmp_path / "torn")
+
+
+THREADS = """
+import faulthandler, sys, threading
+import numpy as np, rit
+faulthandler.dump_traceback_later(60, exit=True)
+policy = rit.Policy.load(sys.argv[1])
+environments = 64
+policy.reset([2] * environments)
+seen = [np.array([[1, 0, 0], [0, 1, 0]])] * environments
+done = threading.Event()
+
+def read():
+    while not done.is_set():
+        policy.utilities()
+
+policy.act(seen)
+reader = threading.Thread(target=read)
+reader.start()
+for _ in range(200):
+    policy.act(seen)
+done.set()
+reader.join()
+"""
+
+
+def test_a_thread_that_acts_and_one_that_reads_do_not_wait_for_each_other(matrix_run):
+    # A process of its own, which its watchdog ends: two threads that wait for each other would stop the tests too.
+    done = subprocess.run([sys.executable, "-c", THREADS, matrix_run], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr

@@ -60,7 +60,7 @@ pub(super) fn measure(
     replay_episodes: usize,
     duration: Duration,
 ) -> Result<Cost, Failure> {
-    let learner = rit_algo::learner(Arc::clone(model), config.update(), params.clone());
+    let learner = model.learner(config.update(), params.clone());
     let mut learner = learner.map_err(Failure::runtime)?;
     let mut replay = Replay::new(replay_episodes);
     let mut replay_bytes = 0;

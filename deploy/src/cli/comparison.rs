@@ -145,7 +145,8 @@ pub struct ReportOptions {
     /// Folder for the report: new, empty, or of an earlier report, which it replaces
     #[arg(long, value_name = "OUT")]
     pub out: PathBuf,
-    /// Write the report even if something else lies in that folder, beside it
+    /// Write the report even if something else lies in that folder: beside it, but index.html, marl-eval.json, runs.csv,
+    /// figures/ and tables/ there are replaced
     #[arg(long)]
     pub force: bool,
     /// Write the page and the tables alone, without runs.csv, marl-eval.json and figures/: what version control may hold

@@ -2,7 +2,7 @@
 
 use super::{CredentialOptions, values::within};
 use clap::{Args, Subcommand};
-use rit_config::count;
+use rit_config::{all_keys, count, is_live};
 use rit_learner::run_handle::EPISODES_MAX;
 use rit_proto::transport::Address;
 use std::path::PathBuf;
@@ -57,10 +57,8 @@ pub enum CtlCommand {
     },
     /// Print the address of the run's web page; it carries the run's token
     Web,
-    /// Change settings while the run goes on: algorithm.epsilon_finish, evaluation.every_env_steps, evaluation.episodes,
-    /// evaluation.testing_every_env_steps, evaluation.testing_episodes,
-    /// checkpoints.every_env_steps, actors.count, actors.heartbeat_timeout_ms, learner.metrics_every_env_steps, and what
-    /// the learner logs, such as log=debug
+    /// Change settings while the run goes on
+    #[command(about = set_about())]
     Set {
         /// What to set
         #[arg(required = true, value_name = "KEY=VALUE")]
@@ -72,4 +70,28 @@ pub enum CtlCommand {
         #[arg(long)]
         drain: bool,
     },
+}
+
+fn set_about() -> String {
+    let live: Vec<String> = all_keys().into_iter().filter(|key| is_live(key)).collect();
+    format!(
+        "Change settings while the run goes on: {}, and what the learner logs, such as log=debug",
+        live.join(", ")
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_help_of_set_names_every_key_that_a_running_learner_can_change() {
+        let about = set_about();
+        for key in
+            ["algorithm.epsilon_finish", "checkpoints.rescue_dir", "learner.stall_timeout_ms", "actors.count"]
+        {
+            assert!(about.contains(key), "{about}");
+        }
+        assert!(!about.contains("algorithm.gamma") && about.ends_with("such as log=debug"), "{about}");
+    }
 }

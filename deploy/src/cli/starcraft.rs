@@ -11,8 +11,8 @@ use std::{ffi::OsString, fmt, net::SocketAddr, path::PathBuf};
 It also takes the options of the game's own program, -listen HOST -port PORT and others, and then ends when its client asks \
 it to quit: a script Versions/Base75689/SC2_x64 that executes `rit starcraft-endpoint \"$@\"` stands in for the game. \
 SMAC's own maps (3m, 8m, 2s3z, 3s5z, MMM, 1c3s5z and others of the units that the simulator knows) bring their armies along; \
-on any other map a client creates its units. A client may send its messages as text; answers are binary. Nobody who can \
-connect is asked who he is.")]
+on any other map a client creates its units. A client may send its messages as text; answers are binary. There is no \
+authentication: every program that can connect may play.")]
 pub struct EndpointOptions {
     /// Where to listen; with port 0 one that is free, which is printed
     #[arg(long, value_name = "IP:PORT")]

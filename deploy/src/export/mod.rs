@@ -39,10 +39,9 @@ fn onnx(options: &ExportOptions, folder: &Path) -> Result<(), Failure> {
     let (_, path) = weights_path(run, options.play.checkpoint.unwrap_or_default())?;
     let weights = Weights::load(&path)?;
     let graphs = rit_onnx::graphs(&weights).map_err(Failure::input)?;
-    fs::create_dir_all(folder)
-        .map_err(|error| Failure::input_message(format!("--onnx {}: {error}", folder.display())))?;
+    fs::create_dir_all(folder).map_err(|error| new_file::failure("--onnx", folder, &error))?;
     for (file, bytes) in files.iter().zip([graphs.encoder, graphs.head]) {
-        new_file::write(file, &bytes, options.force)?;
+        new_file::write("--onnx", file, &bytes, options.force)?;
     }
     let [encoder, head] = files.map(|file| file.display().to_string());
     let digest = &weights.description.digest;
@@ -78,7 +77,7 @@ fn write_episodes(options: &ExportOptions, count: u64, out: &Path) -> Result<(),
         all.push(recorded);
     }
     let bytes = episodes::encode(&all, &player, seed).map_err(Failure::runtime)?;
-    new_file::write(out, &bytes, options.force)?;
+    new_file::write("--out", out, &bytes, options.force)?;
     output::print(&if options.json {
         let task = |(task, steps, mean_return): &(String, usize, f64)| json!({ "task": task, "episodes": count, "steps": steps, "mean_return": mean_return });
         let tasks: Vec<_> = said.iter().map(task).collect();

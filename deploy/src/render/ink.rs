@@ -1,4 +1,4 @@
-//! Colours: few, and told apart by everybody, the colour-blind included. What matters has those of Okabe and
+//! Colours: few, and told apart by all people, the colour-blind included. What matters has those of Okabe and
 //! Ito's palette, which was made for that.
 
 use rit_env::BodyKind;

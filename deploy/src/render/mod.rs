@@ -59,7 +59,7 @@ pub fn run(options: &RenderOptions) -> Result<ExitCode, Failure> {
         Format::Png => png::encode(&film)?,
         Format::Svg => svg::encode(&film).into_bytes(),
     };
-    new_file::write(&options.out, &bytes, options.force)?;
+    new_file::write("--out", &options.out, &bytes, options.force)?;
     let returns: Vec<_> =
         film.episodes.iter().map(|episode| format!("{:.2}", episode.episode.total_reward())).collect();
     output::print(&format!(

@@ -64,10 +64,11 @@ pub fn run(options: &ShapleyOptions) -> Result<ExitCode, Failure> {
     found.weights_digest = weights_file::digest(&trained.params);
     found.episodes = episodes.len();
     if let Some(out) = &options.out {
-        new_file::write(out, rit_report::shapley_figure(&found)?.as_bytes(), options.force)?;
+        let figure = rit_report::shapley_figure(&found)?;
+        new_file::write("--out", out, figure.as_bytes(), options.force)?;
     }
     if let Err(error) = found.keep(&options.run) {
-        // Somebody else's run, say: what was found is printed all the same.
+        // The run may belong to another user: what was found is printed all the same.
         let _ = output::say(&format!("not kept for `rit report`: {error}"));
     }
     output::print(&if options.json { said::json(&found)? } else { said::text(&found) })?;

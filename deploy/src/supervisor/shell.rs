@@ -62,9 +62,7 @@ pub async fn watch_over(
         is_gone: false,
         tracebacks: BTreeSet::new(),
     };
-    let interrupted = shutdown::requested(supervised);
-    tokio::pin!(interrupted);
-    let mut was_interrupted = false;
+    let mut requests = shutdown::Requests::new(supervised);
     let mut event = Event::Begin;
     loop {
         if let Some(outcome) = shell.handle(event) {
@@ -75,10 +73,7 @@ pub async fn watch_over(
             (place, exit) = shell.processes.next_end() => shell.ended(place, exit),
             contacted = &mut shell.contact => shell.contacted(contacted),
             () = at(deadline) => Event::Tick,
-            () = &mut interrupted, if !was_interrupted => {
-                was_interrupted = true;
-                Event::Interrupted
-            }
+            () = requests.next() => Event::Interrupted,
         };
     }
 }
@@ -205,10 +200,11 @@ impl Shell<'_> {
         }
     }
 
+    /// Asks the learner to end its run. What was asked before is not waited for: how the run stood then would look as if it
+    /// had not heard this.
     fn stop_run(&mut self) {
-        if let Some(mut control) = self.control.clone() {
-            // Its end is the answer; one that does not hear is asked how it stands, and found hanging.
-            tokio::spawn(async move { control.stop(StopRequest { drain: false, interrupted: true }).await });
+        if let Some(control) = self.control.clone() {
+            self.contact = Box::pin(stop(control));
         }
     }
 
@@ -257,6 +253,13 @@ async fn reach(run_dir: RunDir) -> Contacted {
 async fn ask(mut control: ControlClient<Client>) -> Contacted {
     tokio::time::sleep(STATUS_EVERY).await;
     match control.status(StatusRequest {}).await {
+        Ok(status) => Contacted::Status(Box::new(status.into_inner())),
+        Err(status) => Contacted::Failed(status.message().to_owned()),
+    }
+}
+
+async fn stop(mut control: ControlClient<Client>) -> Contacted {
+    match control.stop(StopRequest { drain: false, interrupted: true }).await {
         Ok(status) => Contacted::Status(Box::new(status.into_inner())),
         Err(status) => Contacted::Failed(status.message().to_owned()),
     }

@@ -127,7 +127,8 @@ fn value(key: &str, path: &Path) -> Result<String, Failure> {
     let text =
         read_text(path).map_err(|error| Failure::input_message(format!("{}: {error}", path.display())))?;
     let line = |line: &str| if line.is_empty() { "\n".to_owned() } else { format!("    {line}\n") };
-    Ok(format!("  {key}: |\n{}", text.lines().map(line).collect::<String>()))
+    // By how much lines are indented is said: a first line that is itself indented would say more.
+    Ok(format!("  {key}: |2\n{}", text.lines().map(line).collect::<String>()))
 }
 
 /// Experiments that are files: their values in the ConfigMap, and where each comes to lie beside the sweep's file.
@@ -166,100 +167,16 @@ pub fn kubernetes(job: &Job) -> Result<String, Failure> {
         None => (String::new(), false),
     };
     Ok(format!(
-        r#"# {cells} runs of a sweep, each by its pod's index: kubectl apply -f THIS-FILE. A pod that is replaced goes on with its
-# run from the newest checkpoint; one whose run is finished ends at once. With suspend: true the job waits, and pods that
-# run write their checkpoints and go: kubectl patch job rit-{name} -p '{{"spec":{{"suspend":true}}}}'. A queue of Kueue does so by
-# itself (`{program} sweep … --queue NAME`).
-apiVersion: v1
-kind: ConfigMap
-metadata:
-  name: rit-{name}
-  labels: {{ app.kubernetes.io/name: rit }}
-data:
-{text}{experiments}---
-apiVersion: v1
-kind: PersistentVolumeClaim
-metadata:
-  name: rit-{name}
-  labels: {{ app.kubernetes.io/name: rit }}
-spec:
-  # Pods of several nodes write, each to a folder of its own; the volume must be able to hold Unix sockets. Where all run on
-  # one node, ReadWriteOnce will do.
-  accessModes: [ReadWriteMany]
-  resources:
-    requests: {{ storage: 50Gi }}
----
-apiVersion: batch/v1
-kind: Job
-metadata:
-  name: rit-{name}
-  labels:
-    app.kubernetes.io/name: rit{queue}
-spec:
-  suspend: {suspend}
-  completionMode: Indexed
-  completions: {cells}
-  parallelism: {at_once}
-  # A run that fails is tried again from its checkpoint, twice; the others go on whatever becomes of it.
-  backoffLimitPerIndex: 2
-  maxFailedIndexes: {cells}
-  podFailurePolicy:
-    rules:
-      # Bad input is no better a second time.
-      - action: FailIndex
-        onExitCodes: {{ containerName: run, operator: In, values: [2] }}
-      # A drained node is not the run's fault.
-      - action: Ignore
-        onPodConditions: [{{ type: DisruptionTarget, status: "True" }}]
-  template:
-    metadata:
-      labels: {{ app.kubernetes.io/name: rit }}
-    spec:
-      restartPolicy: Never
-      automountServiceAccountToken: false
-      # After SIGTERM a checkpoint is written.
-      terminationGracePeriodSeconds: 120
-      securityContext:
-        runAsNonRoot: true
-        runAsUser: 10001
-        runAsGroup: 10001
-        fsGroup: 10001
-        fsGroupChangePolicy: OnRootMismatch
-        seccompProfile: {{ type: RuntimeDefault }}
-      containers:
-        - name: run
-          image: rit:{version}
-          command: [{program:?}, "sweep", "/sweep/sweep.toml", "--dir", "/runs/{name}"]
-          # Kubernetes says the index.
-          args: ["--cell", "$(JOB_COMPLETION_INDEX)"]
-          securityContext:
-            allowPrivilegeEscalation: false
-            readOnlyRootFilesystem: true
-            capabilities: {{ drop: [ALL] }}
-          resources:
-            requests: {{ cpu: "4", memory: 2Gi }}
-            # What lies in /dev/shm and /tmp counts as memory.
-            limits: {{ memory: 4Gi }}
-          volumeMounts:
-            - {{ name: runs, mountPath: /runs }}
-            - {{ name: sweep, mountPath: /sweep, readOnly: true }}
-            - {{ name: shared-memory, mountPath: /dev/shm }}
-            - {{ name: temporary, mountPath: /tmp }}
-      volumes:
-        - name: runs
-          persistentVolumeClaim: {{ claimName: rit-{name} }}
-        - name: sweep
-          configMap:
-            name: rit-{name}
-            items:
-              - {{ key: sweep.toml, path: sweep.toml }}{places}
-        # How much: deploy/docker/Dockerfile. A container's own /dev/shm has 64 MiB.
-        - name: shared-memory
-          emptyDir: {{ medium: Memory, sizeLimit: 64Mi }}
-        - name: temporary
-          emptyDir: {{ medium: Memory, sizeLimit: 64Mi }}
-"#,
-        version = env!("CARGO_PKG_VERSION"),
+        include_str!("kubernetes.template.yaml"),
+        at_once = at_once,
+        cells = cells,
+        experiments = experiments,
+        name = name,
+        places = places,
         program = program_name(),
+        queue = queue,
+        suspend = suspend,
+        text = text,
+        version = env!("CARGO_PKG_VERSION"),
     ))
 }

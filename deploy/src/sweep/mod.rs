@@ -31,7 +31,7 @@ use std::{
 /// `rit sweep`.
 ///
 /// # Errors
-/// When the file or the folder cannot be used, or no run can be started.
+/// When the file or the folder cannot be used.
 pub async fn run(options: SweepOptions, logs: LogOptions) -> Result<ExitCode, Failure> {
     match &options.command {
         Some(SweepCommand::Status { dir, json }) => return status(dir, *json),
@@ -52,10 +52,10 @@ pub async fn run(options: SweepOptions, logs: LogOptions) -> Result<ExitCode, Fa
     let dir = dir.canonicalize().map_err(Failure::runtime)?;
     let job = || cluster::Job::new(path, &dir, &plan.sweep, options.jobs, options.queue.as_deref());
     if let Some(out) = &options.slurm {
-        return write(out, &cluster::slurm(&job()?), options.force);
+        return write("--slurm", out, &cluster::slurm(&job()?), options.force);
     }
     if let Some(out) = &options.kubernetes {
-        return write(out, &cluster::kubernetes(&job()?)?, options.force);
+        return write("--kubernetes", out, &cluster::kubernetes(&job()?)?, options.force);
     }
     if let Some(index) = options.cell {
         return one(&dir, &plan, index, &options, logs).await;
@@ -130,7 +130,7 @@ async fn all(dir: &Path, plan: &Plan, options: &SweepOptions) -> Result<ExitCode
         Err(TryLockError::Error(_)) | Ok(()) => {}
     }
     let share = Share::of_this_machine(options.jobs);
-    let outcome = run::run_all(dir, plan, share, options.retry, options.json).await?;
+    let outcome = run::run_all(dir, plan, share, options.retry, options.json).await;
     print(&standing::of_all(dir, plan), options.json)?;
     for (cell, why) in outcome.failed.iter().chain(&outcome.left) {
         let _ = output::say(&format!("{cell}: {}", crate::report::printable_sentence(why)));
@@ -158,8 +158,7 @@ fn status(dir: &Path, json: bool) -> Result<ExitCode, Failure> {
 /// `rit sweep collect`.
 fn collect(dir: &Path, out: &Path) -> Result<ExitCode, Failure> {
     let sweep = open(dir)?;
-    fs::create_dir_all(out)
-        .map_err(|error| Failure::input_message(format!("--out {}: {error}", out.display())))?;
+    fs::create_dir_all(out).map_err(|error| new_file::failure("--out", out, &error))?;
     let (mut new, mut there, mut open) = (0, 0, 0);
     for cell in &sweep.cells {
         let stem = out.join(&cell.name);
@@ -228,8 +227,8 @@ fn prepare(dir: &Path, sweep: &Sweep) -> Result<(), Failure> {
     Ok(())
 }
 
-fn write(out: &Path, text: &str, force: bool) -> Result<ExitCode, Failure> {
-    new_file::write(out, text.as_bytes(), force)?;
+fn write(option: &str, out: &Path, text: &str, force: bool) -> Result<ExitCode, Failure> {
+    new_file::write(option, out, text.as_bytes(), force)?;
     let _ = output::say(&format!("{} is written", out.display()));
     Ok(ExitCode::SUCCESS)
 }

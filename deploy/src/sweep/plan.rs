@@ -25,7 +25,7 @@ impl Plan {
     /// When a cell's configuration is wrong, no cell is left, or two cells are the same run.
     pub fn new(file: &SweepFile) -> Result<Self, Failure> {
         let (mut cells, mut configs) = (Vec::new(), Vec::new());
-        // Seed by seed: whatever has been run when somebody looks, methods have as many runs.
+        // Seed by seed: at every moment, methods have about as many runs each.
         for &seed in &file.seeds {
             for values in file.grids.iter().flat_map(|axes| combinations(axes)) {
                 let Some(cell) = cell(file, &values, seed) else { continue };

@@ -5,7 +5,7 @@ use super::{
     screen::Screen,
     standing::{self, Standing, State},
 };
-use crate::{child, control, failure::Failure, report, shutdown};
+use crate::{child, control, report, shutdown};
 use rit_config::RunDir;
 use rit_proto::v1::StatusRequest;
 use rit_record::{Cell, CellState, Ended, Sweep};
@@ -32,7 +32,7 @@ pub struct Outcome {
     pub finished: usize,
     /// Cells, with the reason.
     pub failed: Vec<(String, String)>,
-    /// Cells that somebody stopped, or that another process trains.
+    /// Cells that were stopped, or that another process trains.
     pub left: Vec<(String, String)>,
     pub interrupted: bool,
 }
@@ -86,7 +86,7 @@ fn remove_beginning(root: &Path) {
     if root.join("config.toml").exists() {
         return;
     }
-    // What does not go is somebody else's, and said by the run that finds it there.
+    // What cannot be removed is not a run's beginning; the run that finds it there says so.
     for name in ["run_id", "token", "place", "lock", "config.partial", "place.partial"] {
         let _ = fs::remove_file(root.join(name));
     }
@@ -96,16 +96,7 @@ fn remove_beginning(root: &Path) {
 }
 
 /// Runs all cells that are not finished.
-///
-/// # Errors
-/// When no process can be started at all.
-pub async fn run_all(
-    dir: &Path,
-    plan: &Plan,
-    share: Share,
-    retry: bool,
-    quiet: bool,
-) -> Result<Outcome, Failure> {
+pub async fn run_all(dir: &Path, plan: &Plan, share: Share, retry: bool, quiet: bool) -> Outcome {
     let standings = standing::of_all(dir, plan);
     let is_open = |at: &usize| match standings[*at].state {
         State::Finished => false,
@@ -131,11 +122,10 @@ pub async fn run_all(
         screen: Screen::new(quiet),
     };
     jobs.screen.say(&standing::in_words(&jobs.standings));
-    let interrupted = shutdown::requested(false);
-    tokio::pin!(interrupted);
+    let mut requests = shutdown::Requests::new(false);
     let mut looks = tokio::time::interval(LOOK_EVERY);
     loop {
-        jobs.start_next()?;
+        jobs.start_next();
         if jobs.running.is_empty() {
             break;
         }
@@ -146,11 +136,11 @@ pub async fn run_all(
                 }
             }
             _ = looks.tick(), if !quiet => jobs.look().await,
-            () = &mut interrupted, if !jobs.outcome.interrupted => jobs.interrupt(),
+            () = requests.next() => jobs.interrupt(),
         }
     }
     jobs.screen.finish();
-    Ok(jobs.outcome)
+    jobs.outcome
 }
 
 /// The cells that run, and those that wait for their turn.
@@ -171,9 +161,9 @@ struct Jobs<'a> {
 }
 
 impl Jobs<'_> {
-    fn start_next(&mut self) -> Result<(), Failure> {
+    fn start_next(&mut self) {
         while !self.outcome.interrupted && self.running.len() < self.share.jobs {
-            let Some(at) = self.waiting.pop_front() else { return Ok(()) };
+            let Some(at) = self.waiting.pop_front() else { return };
             let cell = &self.plan.sweep.cells[at];
             let root = Sweep::run_dir(self.dir, cell);
             if RunDir::open(&root).is_ok_and(|(run_dir, _)| run_dir.is_in_use()) {
@@ -183,18 +173,26 @@ impl Jobs<'_> {
                 continue;
             }
             let resumed = Sweep::state(self.dir, cell) != CellState::Waiting;
-            self.start(at)?;
-            let how = if resumed { "goes on" } else { "begins" };
-            self.screen.say(&format!("{}: {how}", cell.name));
+            match self.start(at) {
+                Ok(()) => {
+                    let how = if resumed { "goes on" } else { "begins" };
+                    self.screen.say(&format!("{}: {how}", cell.name));
+                }
+                // Its log or its folder may be what is wrong: the other cells have their own.
+                Err(error) => {
+                    let why = format!("its process could not be started: {error}");
+                    self.screen.say(&format!("{}: failed: {why}", cell.name));
+                    self.outcome.failed.push((cell.name.clone(), why));
+                }
+            }
         }
-        Ok(())
     }
 
-    fn start(&mut self, at: usize) -> Result<(), Failure> {
+    fn start(&mut self, at: usize) -> io::Result<()> {
         let cell = &self.plan.sweep.cells[at];
         let mut command = child::this_program();
         command.args(train_arguments(self.dir, cell, self.share)).args(["--json", "--supervised"]);
-        let mut child = child::spawn(command, &Sweep::log(self.dir, cell), None).map_err(Failure::runtime)?;
+        let mut child = child::spawn(command, &Sweep::log(self.dir, cell), None)?;
         self.running.insert(at, child.id());
         self.children.spawn(async move {
             // Held open: its end tells the run that this process has gone.
@@ -252,10 +250,15 @@ impl Jobs<'_> {
         self.screen.show(standing::in_words(&self.standings), rows);
     }
 
-    /// Asks every run to shut down gracefully.
+    /// Asks every run to shut down gracefully; a second and a third time mean to each what they mean to `rit train`.
     fn interrupt(&mut self) {
-        self.outcome.interrupted = true;
-        self.screen.say("interrupted: the runs write their checkpoints and end");
+        let again = std::mem::replace(&mut self.outcome.interrupted, true);
+        self.screen.say(if again {
+            "interrupted again: the runs are told so; a second interrupt ends the retries of their last files, a third kills \
+             their processes"
+        } else {
+            "interrupted: the runs write their checkpoints and end"
+        });
         for pid in self.running.values() {
             let pid = pid.and_then(|pid| Pid::from_raw(pid as i32));
             // One that has just ended needs no telling.

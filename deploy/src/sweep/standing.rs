@@ -21,7 +21,7 @@ pub enum State {
     Broken,
     /// It ended with an error; it is tried again by the next `rit sweep`.
     Failed,
-    /// A loss was no finite number, and would be again: it is left alone unless somebody asks for another try.
+    /// A loss was no finite number, and would be again: it is left alone unless `--retry` asks for another try.
     Diverged,
     /// All is done.
     Finished,

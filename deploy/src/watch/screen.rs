@@ -77,7 +77,7 @@ impl Screen {
         }
     }
 
-    /// Resolves when somebody wants no more.
+    /// Resolves when `q` or Ctrl-C ends the view.
     pub async fn quit(&mut self) {
         let quit = match self {
             Self::Terminal(_, quits) => quits.recv().await,
@@ -88,7 +88,7 @@ impl Screen {
         }
     }
 
-    /// Waits for so long; whether somebody wanted no more.
+    /// Waits for so long; whether `q` or Ctrl-C ended the view.
     pub async fn quits_within(&mut self, time: Duration) -> bool {
         tokio::time::timeout(time, self.quit()).await.is_ok()
     }

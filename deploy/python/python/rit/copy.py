@@ -30,13 +30,15 @@ from rit._command import Failed, run_command, say, warn
 FORMAT_VERSION = 1
 #: Where lists of files, and files, lie below the prefix.
 LISTS, FILES = "checkpoints", "files"
+#: A checkpoint's name: its steps, and which one at that step it is where it is not the first.
+NAME = r"step-([0-9]{12})(?:-([0-9]{1,9}))?"
+STEP = re.compile(NAME)
+LIST = re.compile(NAME + r"\.json")
 #: What a copy may hold; lists come from outside, so nothing else is written.
 ALLOWED = re.compile(
     r"config\.toml|run_id|place|lineage|metrics\.jsonl|summary\.json|initial\.safetensors"
-    r"|checkpoints/step-[0-9]{12}/[A-Za-z0-9_]+(\.[a-z]+)?|replay/[0-9]{12}\.frames"
+    rf"|checkpoints/{NAME}/[A-Za-z0-9_]+(\.[a-z]+)?|replay/[0-9]{{12}}\.frames"
 )
-STEP = re.compile(r"step-([0-9]{12})")
-LIST = re.compile(r"step-([0-9]{12})\.json")
 DIGEST = re.compile(r"[0-9a-f]{64}")
 #: No list is longer, and no file.
 LIST_MAX, FILE_MAX = 1 << 24, 1 << 36
@@ -100,10 +102,10 @@ class Copier:
     def __init__(self, run: Path, store: Store, keep: int) -> None:
         self.run, self.store, self.keep = run, store, keep
         self.run_id = (run / "run_id").read_text().strip()
-        self.lists = store.names(LISTS)
+        self.lists = {name for name in store.names(LISTS) if LIST.fullmatch(name)}
         self.there = store.names(FILES)
         if self.lists:
-            theirs = _listed(store, max(self.lists)).run_id
+            theirs = _listed(store, max(self.lists, key=_age)).run_id
             if theirs != self.run_id:
                 raise Failed(f"{store.url} holds copies of another run ({theirs}); choose another prefix")
 
@@ -113,7 +115,9 @@ class Copier:
             name = os.readlink(self.run / "checkpoints" / "latest")
         except FileNotFoundError:
             return None
-        return name if STEP.fullmatch(name) else None
+        if not STEP.fullmatch(name):
+            raise Failed(f"{self.run}/checkpoints/latest leads to {name!r}; this package knows names such as step-000000000400")
+        return name
 
     def copy(self, step: str, summary: bool) -> int:
         """Uploads what has changed, then the list; the number of bytes."""
@@ -153,7 +157,7 @@ class Copier:
 
     def _tidy(self) -> None:
         """Removes copies beyond those that are kept, lists first, and what no list names."""
-        lists = sorted(self.lists)
+        lists = sorted(self.lists, key=_age)
         for name in lists[: -self.keep]:
             self.store.delete(f"{LISTS}/{name}")
             self.lists.discard(name)
@@ -173,6 +177,12 @@ class Listed(NamedTuple):
     format_version: int
     #: Place in the run directory, bytes, SHA-256.
     files: list[tuple[str, int, str]]
+
+
+def _age(name: str) -> tuple[int, int]:
+    """What the names of lists are sorted by, oldest first: steps, and which one at that step."""
+    steps, repetition = LIST.fullmatch(name).groups()
+    return int(steps), int(repetition or 1)
 
 
 def _listed(store: Store, name: str) -> Listed:
@@ -235,9 +245,10 @@ def follow(run: Path, url: str, keep: int, once: bool, every_s: float, patience_
 def fetch(url: str, run: Path, at: int | None, patience_s: float) -> str:
     """Fetches the newest copy that is whole into a new folder; its checkpoint's name."""
     store = Store(url)
-    names = sorted((name for name in _again(patience_s, lambda: store.names(LISTS)) if LIST.fullmatch(name)), reverse=True)
+    names = [name for name in _again(patience_s, lambda: store.names(LISTS)) if LIST.fullmatch(name)]
+    names.sort(key=_age, reverse=True)
     if at is not None:
-        names = [name for name in names if int(LIST.fullmatch(name)[1]) == at]
+        names = [name for name in names if _age(name)[0] == at]
     for name in names:
         try:
             return _fetch(store, name, run, patience_s)

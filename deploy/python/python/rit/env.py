@@ -75,7 +75,7 @@ class EntityEnv:
         raise NotImplementedError
 
     def close(self) -> None:
-        """Nobody needs it any more."""
+        """Frees what the environment holds; called once, when it is no longer used."""
 
 
 class ParallelAdapter(EntityEnv):

@@ -18,7 +18,7 @@ import time
 import urllib.error
 import urllib.parse
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +94,33 @@ class Lines:
                     return
                 self.at, self.last = self.at + len(line), line
                 yield line
+
+
+def objects(lines: Iterable[bytes]) -> list[dict[str, Any]]:
+    """The lines that hold a JSON object; a line that was torn when the machine lost power is left out."""
+    found = []
+    for line in lines:
+        try:
+            said = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(said, dict):
+            found.append(said)
+    return found
+
+
+def read_summary(run: Path) -> dict[str, Any] | None:
+    """How the run ended, if it has."""
+    path = run / "summary.json"
+    try:
+        said = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise Failed(f"{path} cannot be read: {error}") from None
+    if not isinstance(said, dict):
+        raise Failed(f"{path} cannot be read: it holds no JSON object")
+    return said
 
 
 def scalars(line: dict[str, Any]) -> dict[str, float]:
@@ -183,8 +210,8 @@ def follow(run: Path, server: Server, experiment: str, once: bool, every_s: floa
         if not run.is_dir():
             raise Failed(f"{run} is gone")
         # Looked for first: what was written before it is read below.
-        summary = _summary(run)
-        new = [json.loads(line) for line in lines.new()]
+        summary = read_summary(run)
+        new = objects(lines.new())
         for header in (line for line in new if line.get("kind") == "run"):
             if copy is None:
                 copy = Copy(server, experiment, run, header)
@@ -200,13 +227,6 @@ def follow(run: Path, server: Server, experiment: str, once: bool, every_s: floa
                 say(f"{sent} lines copied; the run {'has ended: ' + summary['ended'] if summary else 'goes on'}")
                 return
         time.sleep(every_s)
-
-
-def _summary(run: Path) -> dict[str, Any] | None:
-    try:
-        return json.loads((run / "summary.json").read_text())
-    except FileNotFoundError:
-        return None
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -7,21 +7,21 @@ reads the run directory. Names and steps are TensorBoard's. It needs ``pip insta
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
 from rit._command import Failed, run_command, say
-from rit.mlflow import Lines, scalars
+from rit.mlflow import Lines, objects, read_summary, scalars
 
 
 def write(run: Path, folder: Path, project: str) -> str:
     """Writes what there is of a run; the folder of the offline run."""
-    lines = [json.loads(line) for line in Lines(run / "metrics.jsonl").new()]
+    lines = objects(Lines(run / "metrics.jsonl").new())
     headers = [line for line in lines if line.get("kind") == "run"]
     if not headers:
         raise Failed(f"{run}/metrics.jsonl does not say whose it is: there is no run, or an older build wrote it")
+    summary = read_summary(run) or {}
     try:
         import wandb
     except ImportError:
@@ -39,15 +39,11 @@ def write(run: Path, folder: Path, project: str) -> str:
         said = scalars(line)
         if said:
             theirs.log({**said, "env_steps": line["env_steps"]})
-    _end(theirs, run)
+    _end(theirs, summary)
     return str(place)
 
 
-def _end(theirs: Any, run: Path) -> None:
-    try:
-        summary = json.loads((run / "summary.json").read_text())
-    except FileNotFoundError:
-        summary = {}
+def _end(theirs: Any, summary: dict[str, Any]) -> None:
     for task, result in summary.get("evaluation", {}).items():
         for key, name in (("return", "mean_return"), ("win_rate", "win_rate")):
             if result.get(name) is not None:

@@ -198,7 +198,7 @@ class Worker:
             if answer is not None:
                 with self._sending:
                     self._unsent += answer
-                # A slow environment's neighbours are not to look as slow; and nobody waits for the first two.
+                # A slow environment must not delay its neighbours' answers; HELLO and OPEN are answered at once.
                 is_late = time.monotonic() - self._sent_s > UNSENT_S
                 if is_late or kind in (HELLO, OPEN) or len(self._unsent) > UNSENT_MAX:
                     self.flush()
