@@ -71,6 +71,7 @@ fn an_update_that_is_not_finite_ends_the_run_before_it_reaches_anything() {
         let mut params = model.initial(&mut config.seed.stream(Stream::Weights, 0));
         params.iter_mut().for_each(|weight| *weight = (*weight * 1e38).clamp(f32::MIN, f32::MAX));
         let learner = model.learner(config.update(), params.clone()).unwrap();
+        assert_eq!(learner.regime(), method.facts().regime, "{method}");
         let algorithm = Algorithm { model, learner };
         let (writer, written) = write_queue(config.replay_episodes().max(100));
         let (trainer, board) =
