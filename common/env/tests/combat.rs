@@ -120,7 +120,7 @@ fn battles_keep_their_accounts() {
 
 /// Allies that follow the opponent's rule win and lose equally often.
 #[test]
-fn the_simulator_favours_nobody() {
+fn the_simulator_favours_neither_side() {
     for name in ["3m", "4s4z", "3s3z2c"] {
         let set = set_of(name);
         let options = CombatOptions { mirror: true, ..CombatOptions::default() };

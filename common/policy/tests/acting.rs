@@ -88,7 +88,7 @@ fn own_order(order: &[u8], rows: &[f32]) -> Vec<u32> {
 }
 
 #[test]
-fn every_method_acts_as_evaluation_does_whoever_acts_beside() {
+fn every_method_acts_as_evaluation_does_with_any_episodes_beside() {
     for method in Method::ALL {
         let config = config(method);
         let weights = weights(&config);

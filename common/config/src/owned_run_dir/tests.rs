@@ -96,7 +96,7 @@ fn a_run_goes_on_with_other_settings_unless_they_change_the_result() {
 }
 
 #[test]
-fn whoever_comes_second_is_refused_and_touches_nothing() {
+fn the_second_process_is_refused_and_touches_nothing() {
     let (_folder, root) = folder();
     let made = OwnedRunDir::create(&root, &config()).unwrap();
     let before = contents(&root);

@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn armies_stand_apart_and_nobody_stands_on_another() {
+    fn armies_stand_apart_and_no_unit_stands_on_another() {
         for set in CombatSet::ALL {
             for (number, team) in set.teams().into_iter().enumerate() {
                 let world = spawned(set, team, true, number as u64);

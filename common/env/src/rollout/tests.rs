@@ -31,7 +31,7 @@ fn jobs(numbers: std::ops::Range<u64>) -> Vec<Job> {
 }
 
 #[test]
-fn an_episode_is_the_same_whoever_rolls_beside_it() {
+fn an_episode_is_the_same_with_any_episodes_beside_it() {
     let all = all_rolled(rollout(3, true).roll(&mut Fixed([0, 2]), &jobs(0..20))).unwrap();
     for (number, episode) in all.iter().enumerate() {
         let number = number as u64;
@@ -157,7 +157,7 @@ fn a_defeat_on_the_last_step_is_no_cut() {
 }
 
 #[test]
-fn whoever_watches_sees_every_state_of_the_same_episodes() {
+fn a_watched_rollout_shows_every_state_of_the_same_episodes() {
     let set = TaskSet::PredatorPrey;
     let new = || Rollout::new(set.tasks(Split::Training), Arc::new(Embedded::default()), RunSeed(2), true);
     let jobs = jobs(0..5);
