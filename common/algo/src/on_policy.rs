@@ -17,9 +17,8 @@ pub use targets::{Said, Targets};
 
 use crate::{
     PpoConfig, Rows, TerminalStates, UpdateConfig,
-    blocks::decoder::best,
     drive::{shards, tree_sum, tree_sum_f64},
-    estimators::value_norm::ValueNorm,
+    estimators::{greedy::greedy_action, value_norm::ValueNorm},
     learner::Measure,
     networks::Actor,
 };
@@ -274,7 +273,7 @@ impl Losses {
 pub fn choose(logits: &[f32], available: &[u8], exploration: &mut Exploration) -> Action {
     match exploration.sample() {
         Some(u) => categorical::sample(logits, available, u),
-        None => best(logits, available),
+        None => greedy_action(logits, available),
     }
 }
 

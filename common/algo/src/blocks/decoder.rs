@@ -15,7 +15,7 @@ mod tables;
 
 pub use tables::Tables;
 
-use crate::Rows;
+use crate::{Rows, estimators::greedy::greedy_action};
 use rit_nn::{
     Accum, Attention, Buffer, LayoutBuilder, Linear, Tape, Var, View, ViewMut, activation, linear, math,
     matmul, tape::Backward, vectorized,
@@ -313,22 +313,11 @@ vectorized! {
             seen.restart();
             for row in group.queries.clone() {
                 let available = &rows.available[row * decoder.n_actions..][..decoder.n_actions];
-                actions[row] = best(decoder.decide(params, row, &seen, pass), available);
+                actions[row] = greedy_action(decoder.decide(params, row, &seen, pass), available);
                 seen.push(actions[row]);
             }
         }
     }
-}
-
-/// The available action of the largest utility, the lowest index among equals; 0 where none is available.
-pub fn best(utilities: &[f32], available: &[u8]) -> u8 {
-    let mut best: Option<(usize, f32)> = None;
-    for (action, (&utility, &available)) in utilities.iter().zip(available).enumerate() {
-        if available != 0 && best.is_none_or(|(_, most)| utility > most) {
-            best = Some((action, utility));
-        }
-    }
-    best.map_or(0, |(action, _)| action as u8)
 }
 
 /// Softmax over tokens that stand `counts` times each: weight = count · e^(score + bias) / Σ.

@@ -5,8 +5,9 @@ use crate::{
     Rows,
     blocks::{
         Decoder, DecoderPass,
-        decoder::{Seen, Tables, best},
+        decoder::{Seen, Tables},
     },
+    estimators::greedy::greedy_action,
     networks::Actor,
 };
 use rit_episode::{Policy, Turn};
@@ -156,7 +157,7 @@ fn choose_at_once(utilities: &[f32], rows: &Rows, n_actions: usize, turns: &mut 
             let of_row = row * n_actions..(row + 1) * n_actions;
             let available = &rows.available[of_row.clone()];
             let random = turn.exploration.explore(agent, available);
-            *action = random.unwrap_or_else(|| best(&utilities[of_row], available));
+            *action = random.unwrap_or_else(|| greedy_action(&utilities[of_row], available));
         }
     }
 }
@@ -178,7 +179,7 @@ vectorized! {
                 let available = &rows.available[row * n_actions..][..n_actions];
                 let utilities = decoder.decide(params, row, &seen, pass);
                 let random = turn.exploration.explore(row - group.queries.start, available);
-                *action = random.unwrap_or_else(|| best(utilities, available));
+                *action = random.unwrap_or_else(|| greedy_action(utilities, available));
                 seen.push(*action);
             }
         }

@@ -19,10 +19,8 @@ use super::{
 };
 use crate::{
     Rows, UpdateConfig,
-    blocks::{
-        Decoder, DecoderPass, Discriminator, Mixer, MixerWeights, TaskEncoder,
-        decoder::{Tables, best},
-    },
+    blocks::{Decoder, DecoderPass, Discriminator, Mixer, MixerWeights, TaskEncoder, decoder::Tables},
+    estimators::greedy::greedy_action,
     learner::{Draw, Measure},
 };
 use rayon::{ThreadPool, ThreadPoolBuildError, prelude::*};
@@ -105,7 +103,9 @@ impl<'a> Head<'a> {
             Self::Independent(utilities) => {
                 let available = rows.available.chunks_exact(n_actions);
                 let rows = (0..utilities.rows).map(|row| tape.view(*utilities).row(row));
-                rows.zip(available).map(|(utilities, available)| best(utilities, available)).collect()
+                rows.zip(available)
+                    .map(|(utilities, available)| greedy_action(utilities, available))
+                    .collect()
             }
             Self::Ordered(ordered) => {
                 let (decoder, pass) = &mut **ordered;

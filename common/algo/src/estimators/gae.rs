@@ -16,6 +16,12 @@ pub fn advantages(rewards: &[f32], values: &[f64], bootstrap: f64, gamma: f64, l
     advantages
 }
 
+/// The λ-return G_t = A_t + V_t: what the value of a step is trained towards, in the rewards' unit. It is the mean of all
+/// returns that stop after k steps and go on with V, each weighted by (1 − λ) λ^(k − 1).
+pub fn lambda_return(advantage: f64, value: f64) -> f64 {
+    advantage + value
+}
+
 /// Mean and population standard deviation of numbers; 0 and 0 of none.
 pub fn mean_and_deviation(numbers: impl Iterator<Item = f64> + Clone) -> (f64, f64) {
     let count = numbers.clone().count().max(1) as f64;
@@ -43,6 +49,16 @@ mod tests {
         // λ = 0 is one step's error, λ = 1 the discounted return less the value.
         assert_eq!(advantages(&[1.0, 2.0], &[3.0, 4.0], 0.0, 0.5, 0.0), [0.0, -2.0]);
         assert_eq!(advantages(&[1.0, 2.0], &[3.0, 4.0], 0.0, 0.5, 1.0), [-1.0, -2.0]);
+    }
+
+    #[test]
+    fn lambda_returns_by_hand() {
+        // As above: γ = λ = 1/2, truncated with V = 24 after the last step. From the definition, backward:
+        // G_t = r_t + γ ((1 − λ) V_{t+1} + λ G_{t+1}) = 4 + 12, 2 + (8 + 16)/4, 1 + (4 + 8)/4.
+        let values = [2.0, 4.0, 8.0];
+        let advantages = advantages(&[1.0, 2.0, 4.0], &values, 24.0, 0.5, 0.5);
+        let returns: Vec<f64> = advantages.iter().zip(values).map(|(&a, v)| lambda_return(a, v)).collect();
+        assert_eq!(returns, [4.0, 8.0, 16.0]);
     }
 
     #[test]

@@ -140,7 +140,7 @@ fn of_episode(
         let along = gae::advantages(&rewards, &values, bootstrap, config.gamma.into(), config.ppo.gae_lambda);
         for (time, (advantage, value)) in along.into_iter().zip(values).enumerate() {
             advantages[time * per_state + of_agent] = advantage;
-            returns[time * per_state + of_agent] = advantage + value;
+            returns[time * per_state + of_agent] = gae::lambda_return(advantage, value);
         }
     }
     let available = episode.available.chunks_exact(n_actions).take(steps * n);

@@ -100,26 +100,3 @@ fn the_greedy_pass_is_one_agent_after_another() {
     }
     assert!(differs, "somewhere the best action is not available");
 }
-
-#[test]
-fn the_best_available_action_is_the_lowest_of_the_best() {
-    let least = f32::NEG_INFINITY;
-    for (utilities, available, expected) in [
-        ([1.0, 3.0, 2.0], [1, 1, 1], 1),
-        // Ties go to the lowest.
-        ([3.0, 3.0, 3.0], [1, 1, 1], 0),
-        ([1.0, 3.0, 3.0], [1, 1, 1], 1),
-        ([0.0, -0.0, 0.0], [0, 1, 1], 1),
-        // What is not available is never chosen, however good.
-        ([9.0, 1.0, 2.0], [0, 1, 1], 2),
-        ([9.0, 1.0, 1.0], [0, 1, 1], 1),
-        ([9.0, 8.0, -7.0], [0, 0, 1], 2),
-        // However bad what is available is.
-        ([0.0, least, least], [0, 1, 1], 1),
-        ([0.0, f32::MIN, least], [0, 0, 1], 2),
-        // Where nothing is.
-        ([1.0, 3.0, 2.0], [0, 0, 0], 0),
-    ] {
-        assert_eq!(best(&utilities, &available), expected, "{utilities:?}, {available:?}");
-    }
-}
