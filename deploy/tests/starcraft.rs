@@ -185,8 +185,13 @@ fn games_that_cannot_be_replaced_end_their_actor_with_the_last_words() {
     let broken = folder.path().join("broken");
     let program = format!("if [ -e '{}' ]; then {BROKEN}; fi\n{}", broken.display(), stand_in());
     let game = installation(folder.path(), &program);
-    let mut train = train(&folder, &game, &["--actors", "1", "--steps", "100k"]);
-    let status = train.wait_for("episodes", |status| status["ledger"]["inserted"].as_u64() > Some(3));
+    // An evaluation that found the games broken would end the run, so the first one is waited for, and none comes soon after.
+    let evaluations = ["--set", "evaluation.testing_every_env_steps=0"];
+    let mut train =
+        train(&folder, &game, &[&["--actors", "1", "--steps", "100k"], &evaluations[..]].concat());
+    let status = train.wait_for("episodes and an evaluation", |status| {
+        status["ledger"]["inserted"].as_u64() > Some(3) && !status["evaluation"].is_null()
+    });
     let actor = actor_pid(&status, "actor-0").unwrap();
     fs::write(&broken, "").unwrap();
     for (victim, _) in games(&game).iter().filter(|(_, parent)| *parent == actor) {
