@@ -3,6 +3,7 @@
 
 /// The available action of the largest utility, the lowest index among equals; 0 where none is available. `utilities` and
 /// `available` (A).
+#[inline]
 pub fn greedy_action(utilities: &[f32], available: &[u8]) -> u8 {
     let mut best: Option<(usize, f32)> = None;
     for (action, (&utility, &available)) in utilities.iter().zip(available).enumerate() {
